@@ -1,0 +1,162 @@
+"""What a person chooses about a vehicle: physical parameters, limits and weights. SI units, validated, frozen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+N_STATE = 12  # [p, V_B, Theta, Omega]
+N_INPUT = 4  # rotor forces
+POSITION = slice(0, 3)
+VELOCITY = slice(3, 6)  # body axes
+ATTITUDE = slice(6, 9)  # roll, pitch, yaw
+RATES = slice(9, 12)
+FORCES = slice(12, 16)  # rotor forces, appended to the state in plant rows
+
+# Entries of QuadrotorParams.vector(), the form in which compiled kernels read a vehicle.
+MASS, GRAVITY, JX, JY, JZ, ARM, YAW_MOMENT, ROTOR_RATE, DRAG = range(9)
+N_VEHICLE = 9
+
+
+def _require_positive(name: str, value: float, unit: str) -> None:
+    if not (math.isfinite(value) and value > 0.0):
+        raise ValueError(f"{name} must be a finite number > 0 {unit}, got {value!r}")
+
+
+@dataclass(frozen=True, slots=True)
+class QuadrotorParams:
+    """Physical parameters of a plus-configured quadrotor, section 9.4 of the dissertation.
+
+    Raises:
+        ValueError: If a parameter is not finite or not positive (drag may be zero).
+    """
+
+    mass: float = 0.8  # kg
+    gravity: float = 9.8  # m/s^2
+    inertia: tuple[float, float, float] = (0.0224, 0.0224, 0.0436)  # kg m^2, principal moments
+    arm: float = 0.165  # m, centre to rotor
+    yaw_moment: float = 0.002167  # m, yaw torque per rotor force
+    rotor_rate: float = 50.0  # 1/s, lambda_F of Eq. (2.38), a rate and not a time constant
+    drag: float = 0.0  # kg/s, linear drag on the body velocity (0 in the dissertation)
+
+    def __post_init__(self) -> None:
+        for name, unit in (
+            ("mass", "kg"),
+            ("gravity", "m/s^2"),
+            ("arm", "m"),
+            ("yaw_moment", "m"),
+            ("rotor_rate", "1/s"),
+        ):
+            _require_positive(name, float(getattr(self, name)), unit)
+        if len(self.inertia) != 3:
+            raise ValueError(f"inertia needs three principal moments (Jx, Jy, Jz), got {self.inertia!r}")
+        for axis, moment in zip("xyz", self.inertia, strict=True):
+            _require_positive(f"inertia J{axis}", float(moment), "kg m^2")
+        if not (math.isfinite(self.drag) and self.drag >= 0.0):
+            raise ValueError(f"drag must be a finite number >= 0 kg/s, got {self.drag!r}")
+
+    @property
+    def weight(self) -> float:
+        """m g, N."""
+        return self.mass * self.gravity
+
+    @property
+    def hover_force(self) -> float:
+        """u_T = m g / 4, the force of each rotor in hover, N."""
+        return self.weight / 4.0
+
+    def mixer(self) -> Array:
+        """M with [T; tau] = M F, (4, 4): total thrust (N) and torques (N m) of the rotor forces."""
+        L, c = self.arm, self.yaw_moment
+        return np.array([[1.0, 1.0, 1.0, 1.0], [0.0, -L, 0.0, L], [L, 0.0, -L, 0.0], [-c, c, -c, c]])
+
+    def input_matrix(self) -> Array:
+        """B_c of Eq. (2.35) with its missing thrust row restored, (12, 4)."""
+        M = self.mixer()
+        B = np.zeros((N_STATE, N_INPUT))
+        B[5] = -M[0] / self.mass
+        B[RATES] = M[1:] / np.array(self.inertia)[:, None]
+        return B
+
+    def vector(self) -> Array:
+        """The parameters in kernel order (MASS, GRAVITY, JX, ...), (N_VEHICLE,)."""
+        return np.array(
+            [self.mass, self.gravity, *self.inertia, self.arm, self.yaw_moment, self.rotor_rate, self.drag]
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a flight may not exceed. Infinity means no limit.
+
+    The rotor box is physical: the plant saturates. The others are constraints, Eqs. (3.10) and (3.11): exceeding
+    them is counted, costs reward, and is what an MPC plans around.
+
+    Raises:
+        ValueError: If kappa leaves no hover, a limit is not positive, or the position box is empty.
+    """
+
+    kappa: float = 1.0  # -, largest rotor force as a fraction of the weight, Eq. (2.39)
+    rate: float = math.inf  # N/s, change of each rotor command
+    tilt: float = math.inf  # rad, |roll| and |pitch|
+    velocity: float = math.inf  # m/s, each body velocity component
+    position_lower: tuple[float, float, float] = (-math.inf, -math.inf, -math.inf)  # m, NED
+    position_upper: tuple[float, float, float] = (math.inf, math.inf, math.inf)  # m, NED
+
+    def __post_init__(self) -> None:
+        if not 0.25 < self.kappa <= 1.0:
+            raise ValueError(
+                f"kappa must lie in (1/4, 1] so that hover is feasible, got {self.kappa!r}; "
+                "0.3125 gives the dissertation's 2.45 N"
+            )
+        for name, unit in (("rate", "N/s"), ("tilt", "rad"), ("velocity", "m/s")):
+            value = getattr(self, name)
+            if math.isnan(value) or value <= 0.0:
+                raise ValueError(f"{name} limit must be > 0 {unit} (math.inf for none), got {value!r}")
+        if math.isfinite(self.tilt) and self.tilt >= math.pi / 2:
+            raise ValueError(f"tilt limit must be below pi/2 rad (math.inf for none), got {self.tilt!r}")
+        if len(self.position_lower) != 3 or len(self.position_upper) != 3:
+            raise ValueError("position limits need three numbers (x, y, z), m")
+        for axis, low, high in zip("xyz", self.position_lower, self.position_upper, strict=True):
+            if math.isnan(low) or math.isnan(high) or not low < high:
+                raise ValueError(f"position limit on {axis} needs lower < upper, got [{low!r}, {high!r}] m")
+
+    @property
+    def has_position(self) -> bool:
+        """Whether any face of the position box is finite."""
+        return any(math.isfinite(value) for value in (*self.position_lower, *self.position_upper))
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """Diagonals of Q and R of the stage cost |x - x_ref|_Q^2 + |u - u_T|_R^2, per sample.
+
+    Raises:
+        ValueError: If Q has a negative or R a non-positive entry, or a length is wrong.
+    """
+
+    Q: tuple[float, ...] = (1.0,) * N_STATE
+    R: tuple[float, ...] = (1.0,) * N_INPUT
+
+    def __post_init__(self) -> None:
+        if len(self.Q) != N_STATE or len(self.R) != N_INPUT:
+            raise ValueError(
+                f"weights need {N_STATE} entries in Q and {N_INPUT} in R, got {len(self.Q)} and {len(self.R)}"
+            )
+        if not all(math.isfinite(q) and q >= 0.0 for q in self.Q):
+            raise ValueError(f"weights Q must be finite and >= 0, got {self.Q!r}")
+        if not all(math.isfinite(r) and r > 0.0 for r in self.R):
+            raise ValueError(f"weights R must be finite and > 0, got {self.R!r}")
+
+    def Q_matrix(self) -> Array:
+        """Q, (12, 12)."""
+        return np.diag(np.asarray(self.Q, dtype=np.float64))
+
+    def R_matrix(self) -> Array:
+        """R, (4, 4)."""
+        return np.diag(np.asarray(self.R, dtype=np.float64))
