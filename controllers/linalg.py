@@ -1,0 +1,128 @@
+"""Small dense kernels: hand loops, which beat BLAS and LAPACK calls on 12 x 12 matrices.
+
+All arrays are C-contiguous float64; results go into arguments that the caller allocated, which must not
+alias the inputs unless the docstring says so. The innermost loop runs along the contiguous index, so that
+LLVM vectorises it. A result may be larger than needed: only its leading block is written.
+"""
+
+from __future__ import annotations
+
+from quad_envs._numba import kernel
+from quad_envs.parameters import Array
+
+
+@kernel
+def matmul(A: Array, B: Array, out: Array) -> None:
+    """The product A B of A (n, k) and B (k, m) into out (n, m)."""
+    n, inner = A.shape
+    m = B.shape[1]
+    for i in range(n):
+        for j in range(m):
+            out[i, j] = 0.0
+        for k in range(inner):
+            factor = A[i, k]
+            for j in range(m):
+                out[i, j] += factor * B[k, j]
+
+
+@kernel
+def matmul_sparse(A: Array, B: Array, out: Array) -> None:
+    """The product A B into out, skipping the zero entries of A: worth it from about two thirds of zeros."""
+    n, inner = A.shape
+    m = B.shape[1]
+    for i in range(n):
+        for j in range(m):
+            out[i, j] = 0.0
+        for k in range(inner):
+            factor = A[i, k]
+            if factor != 0.0:
+                for j in range(m):
+                    out[i, j] += factor * B[k, j]
+
+
+@kernel
+def matvec(A: Array, x: Array, out: Array) -> None:
+    """The product A x of A (n, k) and x (k,) into out (n,)."""
+    for i in range(A.shape[0]):
+        total = 0.0
+        for j in range(A.shape[1]):
+            total += A[i, j] * x[j]
+        out[i] = total
+
+
+@kernel
+def add_matvec_transposed(A: Array, x: Array, sign: float, out: Array) -> None:
+    """Adds sign A' x to out (n,), for A (k, n) and x (k,), skipping the zero entries of x.
+
+    Where A is symmetric or its transpose is at hand this is the fast way to a product with A: a sum of
+    rows is vectorised, a sum along a row is not (its order would change).
+    """
+    for i in range(A.shape[0]):
+        factor = sign * x[i]
+        if factor != 0.0:
+            for j in range(A.shape[1]):
+                out[j] += factor * A[i, j]
+
+
+@kernel
+def transpose(A: Array, out: Array) -> None:
+    """The transpose of A (n, m) into out (m, n)."""
+    for i in range(A.shape[0]):
+        for j in range(A.shape[1]):
+            out[j, i] = A[i, j]
+
+
+@kernel
+def symmetrise(A: Array) -> None:
+    """A becomes (A + A') / 2, in place."""
+    for i in range(A.shape[0]):
+        for j in range(i):
+            mean = 0.5 * (A[i, j] + A[j, i])
+            A[i, j] = mean
+            A[j, i] = mean
+
+
+@kernel
+def _eliminate_column(A: Array, X: Array, k: int) -> None:
+    """One column of the elimination: largest pivot to row k, then zeros below it, the same done to X."""
+    n = A.shape[0]
+    m = X.shape[1]
+    pivot = k
+    for i in range(k + 1, n):
+        if abs(A[i, k]) > abs(A[pivot, k]):
+            pivot = i
+    if pivot != k:
+        for j in range(k, n):
+            A[k, j], A[pivot, j] = A[pivot, j], A[k, j]
+        for j in range(m):
+            X[k, j], X[pivot, j] = X[pivot, j], X[k, j]
+    inverse = 1.0 / A[k, k]
+    for i in range(k + 1, n):
+        factor = A[i, k] * inverse
+        if factor != 0.0:
+            for j in range(k + 1, n):
+                A[i, j] -= factor * A[k, j]
+            for j in range(m):
+                X[i, j] -= factor * X[k, j]
+
+
+@kernel
+def lu_solve(A: Array, X: Array) -> None:
+    """Solve A Y = X in place by Gaussian elimination with partial pivoting.
+
+    Args:
+        A: Matrix, (n, n); destroyed.
+        X: Right-hand sides on entry, solution on exit, (n, m). A singular A leaves infinities or NaN in it.
+    """
+    n = A.shape[0]
+    m = X.shape[1]
+    for k in range(n):
+        _eliminate_column(A, X, k)
+    for k in range(n - 1, -1, -1):
+        inverse = 1.0 / A[k, k]
+        for j in range(m):
+            X[k, j] *= inverse
+        for i in range(k):
+            factor = A[i, k]
+            for j in range(m):
+                X[i, j] -= factor * X[k, j]
