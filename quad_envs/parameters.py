@@ -18,9 +18,24 @@ ATTITUDE = slice(6, 9)  # roll, pitch, yaw
 RATES = slice(9, 12)
 FORCES = slice(12, 16)  # rotor forces, appended to the state in plant rows
 
-# Entries of QuadrotorParams.vector(), the form in which compiled kernels read a vehicle.
-MASS, GRAVITY, JX, JY, JZ, ARM, YAW_MOMENT, ROTOR_RATE, DRAG = range(9)
-N_VEHICLE = 9
+# Entries of QuadrotorParams.coefficients(), the form in which compiled kernels read a vehicle.
+(
+    GRAVITY,  # m/s^2
+    INV_MASS,  # 1/kg
+    DRAG_RATE,  # 1/s, drag / mass
+    GYRO_X,  # (Jy - Jz) / Jx
+    GYRO_Y,  # (Jz - Jx) / Jy
+    GYRO_Z,  # (Jx - Jy) / Jz
+    ROLL_GAIN,  # L / Jx, rad/s^2 per N
+    PITCH_GAIN,  # L / Jy, rad/s^2 per N
+    YAW_GAIN,  # c / Jz, rad/s^2 per N
+    INV_JX,  # 1/(kg m^2)
+    INV_JY,
+    INV_JZ,
+    ROTOR_RATE,  # lambda_F, 1/s
+    HOVER_FORCE,  # u_T, N
+) = range(14)
+N_COEFFICIENTS = 14
 
 
 def _require_positive(name: str, value: float, unit: str) -> None:
@@ -83,10 +98,26 @@ class QuadrotorParams:
         B[RATES] = M[1:] / np.array(self.inertia)[:, None]
         return B
 
-    def vector(self) -> Array:
-        """The parameters in kernel order (MASS, GRAVITY, JX, ...), (N_VEHICLE,)."""
+    def coefficients(self) -> Array:
+        """The combinations of parameters that the equations of motion use, in kernel order, (N_COEFFICIENTS,)."""
+        Jx, Jy, Jz = self.inertia
         return np.array(
-            [self.mass, self.gravity, *self.inertia, self.arm, self.yaw_moment, self.rotor_rate, self.drag]
+            [
+                self.gravity,
+                1.0 / self.mass,
+                self.drag / self.mass,
+                (Jy - Jz) / Jx,
+                (Jz - Jx) / Jy,
+                (Jx - Jy) / Jz,
+                self.arm / Jx,
+                self.arm / Jy,
+                self.yaw_moment / Jz,
+                1.0 / Jx,
+                1.0 / Jy,
+                1.0 / Jz,
+                self.rotor_rate,
+                self.hover_force,
+            ]
         )
 
 
