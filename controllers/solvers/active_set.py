@@ -1,0 +1,514 @@
+"""Dual active set of Goldfarb and Idnani (1983), with the multipliers of soft rows kept in [0, weight].
+
+Rows a_p'u >= b_p are numbered: 4N each of u >= lower, u <= upper, rate from below, rate from above; then the
+lower sides of the K state rows, then their upper sides. A row is inactive, working (an equality of the current
+face) or saturated: violated with its multiplier at the weight, which makes it a constant in the gradient. So an
+exact L1 penalty needs no slack variable.
+
+With q working normals N_W the kernels keep J = [J_1 J_2] with J J' = H^-1, J_2'N_W = 0, and the triangular R
+with J_1'N_W = R. J is stored by columns (J_T[k] is column k) and starts lower triangular: `first[k]` is the
+first entry of column k that may be non-zero, a multiple of 4. R is stored by columns as well.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_envs._numba import kernel
+from quad_envs.parameters import N_INPUT, Array
+
+from ..linalg import add_matvec_transposed
+from ..ocp import IntArray
+from ..riccati import step_plan
+
+ByteArray = NDArray[np.int8]
+
+OPTIMAL, INFEASIBLE, ITERATION_LIMIT, NOT_FINITE = range(4)  # the members of Status, for compiled code
+ROW_TOLERANCE = 1e-9  # in the units of the row
+N_VECTORS = 7  # rows of the scratch array `vectors`
+_INACTIVE, _WORKING, _SATURATED = range(3)
+_DEPENDENT = 1e-13  # |J_2'a|^2 over |J'a|^2 below which a normal lies in the span of the working ones
+_NO_DIRECTION = 1e-13  # smallest multiplier direction that counts
+
+
+@kernel
+def row_spans(normals: Array, spans: IntArray) -> None:
+    """First and one past the last non-zero entry of each normal: most state rows read one or three states."""
+    for h in range(normals.shape[0]):
+        start = normals.shape[1]
+        stop = 0
+        for a in range(normals.shape[1]):
+            if normals[h, a] != 0.0:
+                start = min(start, a)
+                stop = a + 1
+        spans[h, 0] = start
+        spans[h, 1] = stop
+
+
+@kernel
+def _worst_input_row(
+    u: Array,
+    lower: Array,
+    upper: Array,
+    rate_step: float,
+    first_move: Array,
+    state: ByteArray,
+) -> tuple[int, float]:
+    """The inactive box or rate row with the most negative slack; (-1, -tolerance) if there is none."""
+    N, m = u.shape
+    nv = N * m
+    worst = -ROW_TOLERANCE
+    row = -1
+    for i in range(N):
+        for a in range(m):
+            k = m * i + a
+            value = u[i, a]
+            slack = value - lower[a]
+            if slack < worst and state[k] == _INACTIVE:
+                worst, row = slack, k
+            slack = upper[a] - value
+            if slack < worst and state[nv + k] == _INACTIVE:
+                worst, row = slack, nv + k
+            if i == 0:
+                below = value - first_move[0, a]
+                above = first_move[1, a] - value
+            else:
+                below = value - u[i - 1, a] + rate_step
+                above = u[i - 1, a] + rate_step - value
+            if below < worst and state[2 * nv + k] == _INACTIVE:
+                worst, row = below, 2 * nv + k
+            if above < worst and state[3 * nv + k] == _INACTIVE:
+                worst, row = above, 3 * nv + k
+    return row, worst
+
+
+@kernel
+def _worst_state_row(
+    x: Array,
+    normals: Array,
+    normal: IntArray,
+    stage: IntArray,
+    row_lower: Array,
+    row_upper: Array,
+    weight: Array,
+    spans: IntArray,
+    base: int,
+    state: ByteArray,
+    row: int,
+    worst: float,
+) -> tuple[int, float]:
+    """As above among the state rows, where a saturated row that is satisfied counts as well; row ids from base."""
+    K = normal.shape[0]
+    for k in range(K):
+        h = normal[k]
+        value = 0.0
+        for a in range(spans[h, 0], spans[h, 1]):
+            value += normals[h, a] * x[stage[k], a]
+        for side in range(2):
+            slack = value - row_lower[k] if side == 0 else row_upper[k] - value
+            p = base + side * K + k
+            if state[p] == _SATURATED:
+                slack = -slack
+            if slack < worst and state[p] != _WORKING and weight[k] > 0.0:
+                worst, row = slack, p
+    return row, worst
+
+
+@kernel
+def _input_normal(p: int, nv: int, a: Array) -> tuple[int, int]:
+    """Normal of a box or rate row into a; returns the range of whole stages outside which it is zero."""
+    m = N_INPUT
+    k = p % nv
+    kind = p // nv
+    stop = m * (k // m + 1)
+    start = max(stop - m, 0) if kind < 2 else max(stop - 2 * m, 0)
+    for j in range(start, stop):
+        a[j] = 0.0
+    sign = 1.0 if kind % 2 == 0 else -1.0
+    a[k] = sign
+    if kind >= 2 and k >= m:
+        a[k - m] = -sign
+    return start, stop
+
+
+@kernel
+def _state_normal(h: Array, stage: int, sign: float, A: Array, B: Array, y: Array, A_y: Array, a: Array) -> int:
+    """Normal of the row sign h'x_stage in the inputs: a_i = B_i'y, y <- A_i'y backwards; returns its length."""
+    n, m = B.shape[1], B.shape[2]
+    for b in range(n):
+        y[b] = sign * h[b]
+    for i in range(stage - 1, -1, -1):
+        j = i if A.shape[0] > 1 else 0
+        block = a[m * i : m * (i + 1)]
+        for b in range(m):
+            block[b] = 0.0
+        add_matvec_transposed(B[j], y, 1.0, block)
+        if i > 0:
+            for b in range(n):
+                A_y[b] = 0.0
+            add_matvec_transposed(A[j], y, 1.0, A_y)
+            for b in range(n):
+                y[b] = A_y[b]
+    return m * stage
+
+
+@kernel
+def _project(J_T: Array, first: IntArray, a: Array, start: int, stop: int, d: Array) -> float:
+    """d = J'a and |d|^2; a is zero outside start..stop. Four partial sums, so that the loop vectorises."""
+    total = 0.0
+    for k in range(J_T.shape[0]):
+        s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+        for j in range(max(start, first[k]), stop, 4):
+            s0 += J_T[k, j] * a[j]
+            s1 += J_T[k, j + 1] * a[j + 1]
+            s2 += J_T[k, j + 2] * a[j + 2]
+            s3 += J_T[k, j + 3] * a[j + 3]
+        value = (s0 + s1) + (s2 + s3)
+        d[k] = value
+        total += value * value
+    return total
+
+
+@kernel
+def _primal_direction(J_T: Array, first: IntArray, d: Array, q: int, z: Array) -> tuple[float, int]:
+    """z = J_2 d_2; returns |d_2|^2 and the first entry of z that may be non-zero."""
+    nv = J_T.shape[0]
+    zeta = 0.0
+    start = nv
+    for j in range(nv):
+        z[j] = 0.0
+    for k in range(q, nv):
+        factor = d[k]
+        if factor != 0.0:
+            zeta += factor * factor
+            start = min(start, first[k])
+            for j in range(first[k], nv):
+                z[j] += factor * J_T[k, j]
+    return zeta, start
+
+
+@kernel
+def _solve_triangle(R_T: Array, d: Array, q: int, r: Array) -> None:
+    """r = R^-1 d_1, by columns."""
+    for i in range(q):
+        r[i] = d[i]
+    for i in range(q - 1, -1, -1):
+        r[i] /= R_T[i, i]
+        factor = r[i]
+        for j in range(i):
+            r[j] -= factor * R_T[i, j]
+
+
+@kernel
+def _first_to_leave(
+    nu: Array, r: Array, cap: Array, q: int
+) -> tuple[float, int, bool]:
+    """Longest step nu - t r within [0, cap]: its length, the row that stops it, and whether it stops at its cap."""
+    longest = math.inf
+    leaving = -1
+    at_cap = False
+    for i in range(q):
+        if r[i] > _NO_DIRECTION:
+            t = nu[i] / r[i]
+            if t < longest:
+                longest, leaving, at_cap = t, i, False
+        elif r[i] < -_NO_DIRECTION:
+            t = (cap[i] - nu[i]) / (-r[i])
+            if t < longest:
+                longest, leaving, at_cap = t, i, True
+    return longest, leaving, at_cap
+
+
+@kernel
+def _widen(J_T: Array, first: IntArray, k: int, start: int) -> None:
+    """Makes column k of J valid from entry start."""
+    for j in range(start, first[k]):
+        J_T[k, j] = 0.0
+    first[k] = min(first[k], start)
+
+
+@kernel
+def _append(J_T: Array, R_T: Array, first: IntArray, d: Array, z: Array, zeta: float, start: int, q: int) -> None:
+    """Adds the row with d = J'a to the working set: reflects J_2 so that d_2 has one entry, and extends R.
+
+    The reflection I - beta v v', v = d_2 - delta e_1, needs w = J_2 v = z - delta J_q: z is known already, so this
+    costs one pass over J_2, a third of a sweep of Givens rotations.
+    """
+    nv = J_T.shape[0]
+    norm = math.sqrt(zeta)
+    delta = -norm if d[q] > 0.0 else norm
+    _widen(J_T, first, q, start)
+    start = first[q]
+    v_q = d[q] - delta
+    beta = 1.0 / (norm * (norm + abs(d[q])))
+    for j in range(start, nv):
+        z[j] -= delta * J_T[q, j]
+    d[q] = v_q
+    for k in range(q, nv):
+        if d[k] != 0.0:
+            _widen(J_T, first, k, start)
+            factor = beta * d[k]
+            for j in range(start, nv):
+                J_T[k, j] -= factor * z[j]
+    for i in range(q):
+        R_T[q, i] = d[i]
+    R_T[q, q] = delta
+
+
+@kernel
+def _remove(
+    J_T: Array,
+    R_T: Array,
+    first: IntArray,
+    active: IntArray,
+    sign: Array,
+    nu: Array,
+    cap: Array,
+    leaving: int,
+    q: int,
+) -> None:
+    """Takes working row `leaving` out of q; entry q (the row on its way in) moves to q - 1. R stays triangular."""
+    nv = J_T.shape[0]
+    for j in range(leaving, q):
+        active[j], sign[j], nu[j], cap[j] = active[j + 1], sign[j + 1], nu[j + 1], cap[j + 1]
+    for j in range(leaving, q - 1):
+        for i in range(j + 2):
+            R_T[j, i] = R_T[j + 1, i]
+    for k in range(leaving, q - 1):
+        f, g = R_T[k, k], R_T[k, k + 1]
+        length = math.sqrt(f * f + g * g)
+        if length == 0.0:
+            continue
+        cos, sin = f / length, g / length
+        for j in range(k, q - 1):
+            f, g = R_T[j, k], R_T[j, k + 1]
+            R_T[j, k] = cos * f + sin * g
+            R_T[j, k + 1] = cos * g - sin * f
+        start = min(first[k], first[k + 1])
+        _widen(J_T, first, k, start)
+        _widen(J_T, first, k + 1, start)
+        for j in range(start, nv):
+            f, g = J_T[k, j], J_T[k + 1, j]
+            J_T[k, j] = cos * f + sin * g
+            J_T[k + 1, j] = cos * g - sin * f
+
+
+@kernel
+def _move(u: Array, z: Array, start: int, t: float, nu: Array, r: Array, q: int, primal: bool) -> None:
+    """One step of length t: multipliers along -r (own multiplier up), inputs along z."""
+    for i in range(q):
+        nu[i] -= t * r[i]
+    nu[q] += t
+    if primal:
+        flat = u.reshape(-1)
+        for j in range(start, flat.shape[0]):
+            flat[j] += t * z[j]
+
+
+@kernel
+def _enter(
+    J_T: Array,
+    R_T: Array,
+    first: IntArray,
+    a: Array,
+    a_start: int,
+    a_stop: int,
+    slack: float,
+    u: Array,
+    state: ByteArray,
+    active: IntArray,
+    vectors: Array,
+    q: int,
+    iterations: int,
+    iteration_limit: int,
+) -> tuple[int, int, int]:
+    """Brings the row stored as entry q into the working set, or saturates or releases it.
+
+    Returns:
+        The new q, the iteration count, and OPTIMAL (done with this row), INFEASIBLE or ITERATION_LIMIT.
+    """
+    d, z, r, sign, nu, cap = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4], vectors[5]
+    while iterations < iteration_limit:
+        iterations += 1
+        length = _project(J_T, first, a, a_start, a_stop, d)
+        zeta, start = _primal_direction(J_T, first, d, q, z)
+        _solve_triangle(R_T, d, q, r)
+        dual, leaving, at_cap = _first_to_leave(nu, r, cap, q)
+        full = -slack / zeta if zeta > _DEPENDENT * length else math.inf
+        own = cap[q] - nu[q]
+        t = min(dual, min(full, own))
+        if t == math.inf:
+            return q, iterations, INFEASIBLE
+        primal = full < math.inf
+        _move(u, z, start, t, nu, r, q, primal)
+        if primal:
+            slack += t * zeta
+        if full <= dual and full <= own:
+            _append(J_T, R_T, first, d, z, zeta, start, q)
+            state[active[q]] = _WORKING
+            return q + 1, iterations, OPTIMAL
+        if own <= dual:
+            # Saturated and inactive exchange: a row that came from saturation has its multiplier counted down.
+            state[active[q]] = _SATURATED if sign[q] > 0.0 else _INACTIVE
+            return q, iterations, OPTIMAL
+        saturates = at_cap == (sign[leaving] > 0.0)
+        state[active[leaving]] = _SATURATED if saturates else _INACTIVE
+        _remove(J_T, R_T, first, active, sign, nu, cap, leaving, q)
+        q -= 1
+    return q, iterations, ITERATION_LIMIT
+
+
+@kernel
+def dual_active_set(
+    A: Array,
+    B: Array,
+    c: Array,
+    transposed: Array,
+    lower: Array,
+    upper: Array,
+    rate_step: float,
+    first_move: Array,
+    normals: Array,
+    normal: IntArray,
+    stage: IntArray,
+    row_lower: Array,
+    row_upper: Array,
+    weight: Array,
+    row: int,
+    slack: float,
+    iteration_limit: int,
+    u: Array,
+    x: Array,
+    multipliers: Array,
+    J_T: Array,
+    R_T: Array,
+    first: IntArray,
+    active: IntArray,
+    spans: IntArray,
+    state: ByteArray,
+    vectors: Array,
+) -> tuple[int, int]:
+    """From the unconstrained optimum u to the constrained one.
+
+    Args:
+        A: (1 or N, 12, 12).
+        B: (1 or N, 12, 4).
+        c: (N, 12).
+        transposed: [A_i B_i]', (1 or N, 16, 12).
+        lower: Input box, (4,).
+        upper: (4,).
+        rate_step: Largest change of an input from stage to stage.
+        first_move: Bounds of the rate rows on u_0, (2, 4).
+        normals: As in `StateRows`, likewise the next five.
+        normal: (K,).
+        stage: (K,).
+        row_lower: (K,).
+        row_upper: (K,).
+        weight: (K,).
+        row: The most violated row of u.
+        slack: Its slack, < 0.
+        iteration_limit: Largest number of steps.
+        u: Inputs, (N, 4); the unconstrained optimum on entry, the result on exit.
+        x: Its states, (N+1, 12), likewise.
+        multipliers: Result, (16N + 2K,), in the numbering of the rows.
+        J_T: Inverse factor of the Hessian by columns, (4N, 4N); destroyed.
+        R_T: Overwritten, (4N, 4N).
+        first: As left by `inverse_factor`, (4N,).
+        active: Overwritten, (4N + 1,).
+        spans: As left by `row_spans`.
+        state: All rows inactive (zero) on entry, (16N + 2K,).
+        vectors: Overwritten, (N_VECTORS, 4N + 12).
+
+    Returns:
+        OPTIMAL, INFEASIBLE or ITERATION_LIMIT, and the number of steps.
+    """
+    N, m = u.shape
+    K = normal.shape[0]
+    nv = N * m
+    base = 4 * nv
+    a, sign, nu, cap = vectors[6], vectors[3], vectors[4], vectors[5]
+    q = 0
+    iterations = 0
+    status = OPTIMAL
+    while row >= 0:
+        active[q] = row
+        nu[q] = 0.0
+        sign[q] = 1.0
+        cap[q] = math.inf
+        if row < base:
+            a_start, a_stop = _input_normal(row, nv, a)
+        else:
+            k = (row - base) % K
+            sign[q] = -1.0 if state[row] == _SATURATED else 1.0
+            cap[q] = weight[k]
+            side = 1.0 if row < base + K else -1.0
+            a_start = 0
+            a_stop = _state_normal(
+                normals[normal[k]], stage[k], side * sign[q], A, B, vectors[0, :12], vectors[1, :12], a
+            )
+        q, iterations, status = _enter(
+            J_T, R_T, first, a, a_start, a_stop, slack, u, state, active, vectors, q, iterations, iteration_limit
+        )
+        if status != OPTIMAL:
+            break
+        row, slack = _worst_input_row(u, lower, upper, rate_step, first_move, state)
+        if K > 0:
+            for i in range(N):
+                step_plan(transposed, c, i, u, x)
+            row, slack = _worst_state_row(
+                x, normals, normal, stage, row_lower, row_upper, weight, spans, base, state, row, slack
+            )
+    for i in range(N):
+        step_plan(transposed, c, i, u, x)
+    _collect_multipliers(state, active, sign, nu, cap, weight, q, base, multipliers)
+    return status, iterations
+
+
+@kernel
+def _collect_multipliers(
+    state: ByteArray,
+    active: IntArray,
+    sign: Array,
+    nu: Array,
+    cap: Array,
+    weight: Array,
+    q: int,
+    base: int,
+    multipliers: Array,
+) -> None:
+    """Multiplier of every row: counted up from 0 or down from the cap if working, the cap if saturated."""
+    K = weight.shape[0]
+    for k in range(2 * K):
+        if state[base + k] == _SATURATED:
+            multipliers[base + k] = weight[k % K]
+    for i in range(q):
+        multipliers[active[i]] = nu[i] if sign[i] > 0.0 else cap[i] - nu[i]
+
+
+@kernel
+def worst_row(
+    u: Array,
+    x: Array,
+    lower: Array,
+    upper: Array,
+    rate_step: float,
+    first_move: Array,
+    normals: Array,
+    normal: IntArray,
+    stage: IntArray,
+    row_lower: Array,
+    row_upper: Array,
+    weight: Array,
+    spans: IntArray,
+    state: ByteArray,
+) -> tuple[int, float]:
+    """The row to work on next and its slack, or -1 if the plan (u, x) is optimal."""
+    row, slack = _worst_input_row(u, lower, upper, rate_step, first_move, state)
+    if normal.shape[0] == 0:
+        return row, slack
+    return _worst_state_row(
+        x, normals, normal, stage, row_lower, row_upper, weight, spans, 4 * u.size, state, row, slack
+    )
