@@ -1,0 +1,98 @@
+"""Limits as constraint rows: their names, values and violation; and the map between actions and rotor forces."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ._numba import inline_kernel, kernel
+from .parameters import Array, Limits
+
+TOLERANCE = 1e-5  # SI; a float32 action alone moves a rotor command by up to 4e-7 N
+
+# A violation that large costs the whole reward of a step.
+TILT_SCALE = 0.1  # rad
+VELOCITY_SCALE = 0.5  # m/s
+POSITION_SCALE = 0.1  # m
+# for the command rate it is the largest permitted change itself
+
+
+def constraint_names(limits: Limits) -> tuple[str, ...]:
+    """Names of the constraint rows that these limits make, in the order of `constraint_values`."""
+    rows = (
+        ("tilt", math.isfinite(limits.tilt)),
+        ("velocity", math.isfinite(limits.velocity)),
+        ("position", limits.has_position),
+        ("rate", math.isfinite(limits.rate)),
+    )
+    return tuple(name for name, present in rows if present)
+
+
+def constraint_values(plant: ArrayLike, command: ArrayLike, previous: ArrayLike, limits: Limits, dt: float) -> Array:
+    """Value minus limit of each row, in SI units; positive means violated. Readable twin of the environments' kernel.
+
+    Args:
+        plant: [p, V_B, Theta, Omega, ...], (..., >= 12).
+        command: Rotor commands of the step that led there, (..., 4), N.
+        previous: Rotor commands of the step before, (..., 4), N.
+        limits: The limits.
+        dt: Control period, s.
+
+    Returns:
+        (..., number of rows).
+    """
+    x = np.asarray(plant, dtype=np.float64)
+    p, V_B, tilt = x[..., 0:3], x[..., 3:6], x[..., 6:8]
+    outside = np.maximum(np.asarray(limits.position_lower) - p, p - np.asarray(limits.position_upper))
+    change = np.abs(np.asarray(command, dtype=np.float64) - np.asarray(previous, dtype=np.float64))
+    value = {
+        "tilt": np.abs(tilt).max(axis=-1) - limits.tilt,
+        "velocity": np.abs(V_B).max(axis=-1) - limits.velocity,
+        "position": outside.max(axis=-1),
+        "rate": change.max(axis=-1) - limits.rate * dt,
+    }
+    rows = [np.broadcast_to(value[name], x.shape[:-1]) for name in constraint_names(limits)]
+    return np.stack(rows, axis=-1) if rows else np.zeros((*x.shape[:-1], 0))
+
+
+def constraint_scales(limits: Limits, dt: float) -> Array:
+    """Violation of each row that costs the whole reward of a step, (number of rows,)."""
+    scale = {"tilt": TILT_SCALE, "velocity": VELOCITY_SCALE, "position": POSITION_SCALE, "rate": limits.rate * dt}
+    return np.array([scale[name] for name in constraint_names(limits)])
+
+
+@inline_kernel
+def force_from_action(action, hover, force_max):  # type: ignore[no-untyped-def]
+    """Rotor command of one action entry in [-1, 1]: -1 -> 0, 0 -> hover, +1 -> force_max, piecewise linear."""
+    return hover + action * (hover if action < 0.0 else force_max - hover)
+
+
+@kernel
+def _actions_from_forces(forces, hover, force_max, out):  # type: ignore[no-untyped-def]
+    for i in range(forces.size):
+        change = forces[i] - hover
+        out[i] = min(max(change / (hover if change < 0.0 else force_max - hover), -1.0), 1.0)
+
+
+def actions_from_forces(forces: Array, hover: float, force_max: float) -> NDArray[np.float32]:
+    """Actions that command these rotor forces, the inverse of `forces_from_actions`.
+
+    Args:
+        forces: (..., 4), N, C-contiguous; forces outside [0, force_max] are clipped.
+        hover: Force of action 0, N.
+        force_max: Force of action +1, N.
+
+    Returns:
+        (..., 4), float32.
+    """
+    out = np.empty(forces.shape, dtype=np.float32)
+    _actions_from_forces(forces.reshape(-1), hover, force_max, out.reshape(-1))
+    return out
+
+
+def forces_from_actions(actions: ArrayLike, hover: float, force_max: float) -> Array:
+    """Rotor commands of actions in [-1, 1], (..., 4), N."""
+    a = np.clip(np.asarray(actions, dtype=np.float64), -1.0, 1.0)
+    return np.asarray(hover + a * np.where(a < 0.0, hover, force_max - hover))

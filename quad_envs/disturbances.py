@@ -1,0 +1,156 @@
+"""Disturbances, as data: rows [torque 3 (body axes, N m), force 3 (inertial axes, N)] at the integrator's stage times.
+
+A disturbance gives its value at nodes t of shape (n_steps, 2 substeps + 1): row k holds the stage times of control
+step k, so that a step may begin or end a pulse without smearing it over its neighbour.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar, Protocol, runtime_checkable
+
+import numpy as np
+
+from .parameters import Array
+
+_Vector = tuple[float, float, float]
+_ZERO: _Vector = (0.0, 0.0, 0.0)
+
+
+@runtime_checkable
+class Disturbance(Protocol):
+    """What an environment needs of a disturbance."""
+
+    @property
+    def random(self) -> bool:
+        """Whether `values` draws from the generator."""
+        ...
+
+    def values(self, t: Array, rng: np.random.Generator) -> Array:
+        """Torque and force at the nodes t (n_steps, n_nodes), s: (n_steps, n_nodes, 6)."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class TorquePulse:
+    """e^{-0.1 a} [sin 10a, cos 10a, 0] N m while start < t < stop, section 4.6.
+
+    The text does not say from when `a` counts. `clock="absolute"` (a = t) is the reading that a vehicle with the
+    printed rotors survives; `"relative"` (a = t - start) starts with 1 N m, beyond its roll authority of 0.65 N m.
+
+    Raises:
+        ValueError: If the clock is unknown or start >= stop.
+    """
+
+    start: float = 5.0  # s
+    stop: float = 10.0  # s
+    amplitude: float = 1.0  # N m at a = 0
+    frequency: float = 10.0  # rad/s
+    decay: float = 0.1  # 1/s
+    clock: str = "absolute"
+    random: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if self.clock not in ("absolute", "relative"):
+            raise ValueError(f"clock must be 'absolute' or 'relative', got {self.clock!r}")
+        if not self.start < self.stop:
+            raise ValueError(f"a pulse needs start < stop, got {self.start!r} and {self.stop!r} s")
+
+    def values(self, t: Array, rng: np.random.Generator) -> Array:
+        """Torque and force at the nodes, (n_steps, n_nodes, 6); a control step is inside or outside as a whole."""
+        a = t - self.start if self.clock == "relative" else t
+        middle = t[:, t.shape[1] // 2]
+        inside = ((middle > self.start) & (middle < self.stop))[:, None]
+        size = np.where(inside, self.amplitude * np.exp(-self.decay * a), 0.0)
+        out = np.zeros((*t.shape, 6))
+        out[..., 0] = size * np.sin(self.frequency * a)
+        out[..., 1] = size * np.cos(self.frequency * a)
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class Steady:
+    """A constant force and torque: wind, a shifted centre of mass."""
+
+    force: _Vector = (0.5, 0.0, 0.0)  # N, inertial
+    torque: _Vector = _ZERO  # N m, body
+    random: ClassVar[bool] = False
+
+    def values(self, t: Array, rng: np.random.Generator) -> Array:
+        """Torque and force at the nodes, (n_steps, n_nodes, 6)."""
+        return np.broadcast_to(np.array([*self.torque, *self.force]), (*t.shape, 6)).copy()
+
+
+@dataclass(frozen=True, slots=True)
+class Gusts:
+    """Force and torque as first-order Gauss-Markov processes: turbulence with a correlation time.
+
+    Raises:
+        ValueError: If a deviation is negative or the correlation time is not positive.
+    """
+
+    force: float = 0.5  # N, standard deviation of each inertial component
+    torque: float = 0.02  # N m, standard deviation of each body component
+    correlation_time: float = 1.0  # s
+    random: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if self.force < 0.0 or self.torque < 0.0:
+            raise ValueError(f"gust deviations must be >= 0, got force {self.force!r} N, torque {self.torque!r} N m")
+        if not self.correlation_time > 0.0:
+            raise ValueError(f"correlation_time must be > 0 s, got {self.correlation_time!r}")
+
+    def values(self, t: Array, rng: np.random.Generator) -> Array:
+        """Torque and force at the nodes, (n_steps, n_nodes, 6); the last node of a step is the first of the next."""
+        steps, nodes = t.shape
+        times = np.append(t[:, :-1].ravel(), t[-1, -1])
+        keep = math.exp(-float(times[1] - times[0]) / self.correlation_time)
+        white = rng.standard_normal((times.size, 6)) * np.repeat([self.torque, self.force], 3)
+        white[1:] *= math.sqrt(1.0 - keep * keep)
+        for i in range(1, times.size):
+            white[i] += keep * white[i - 1]
+        index = np.arange(steps)[:, None] * (nodes - 1) + np.arange(nodes)
+        return np.asarray(white[index])
+
+
+@dataclass(frozen=True, slots=True)
+class Impulse:
+    """A push: linear and angular momentum given evenly over the control period that contains `time`."""
+
+    time: float = 2.0  # s
+    momentum: _Vector = (0.8, 0.0, 0.0)  # N s, inertial
+    angular_momentum: _Vector = _ZERO  # N m s, body
+    random: ClassVar[bool] = False
+
+    def values(self, t: Array, rng: np.random.Generator) -> Array:
+        """Torque and force at the nodes, (n_steps, n_nodes, 6)."""
+        out = np.zeros((*t.shape, 6))
+        hit = (t[:, 0] <= self.time + 1e-9) & (self.time + 1e-9 < t[:, -1])
+        duration = t[0, -1] - t[0, 0]
+        out[hit] = np.array([*self.angular_momentum, *self.momentum]) / duration
+        return out
+
+
+_BY_NAME: dict[str, Callable[[], Disturbance]] = {
+    "torque-pulse": TorquePulse,
+    "steady": Steady,
+    "gusts": Gusts,
+    "impulse": Impulse,
+}
+
+
+def make_disturbance(what: str | Disturbance | None) -> Disturbance | None:
+    """A disturbance from a name, itself, or None (also "none").
+
+    Raises:
+        ValueError: If it is none of these.
+    """
+    if what is None or what == "none":
+        return None
+    if isinstance(what, str) and what in _BY_NAME:
+        return _BY_NAME[what]()
+    if isinstance(what, Disturbance):
+        return what
+    raise ValueError(f"disturbance must be None, one of {sorted(_BY_NAME)}, or a Disturbance; got {what!r}")

@@ -1,0 +1,1 @@
+"""Environment classes; `gymnasium.make` imports them on demand."""

@@ -1,0 +1,174 @@
+"""A batch of tracking flights: the arrays that the kernel works on, and the reset of one of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..disturbances import Disturbance, make_disturbance
+from ..observations import N_REFERENCE
+from ..parameters import N_STATE, Array
+from ..references import Reference, make_reference
+from .kernel import (
+    COEFFICIENTS,
+    COMMAND,
+    FORCE_MAX,
+    PLANT,
+    ROW_SIZE,
+    SCRATCH_SIZE,
+    observe_row,
+    step_rows,
+    task_vector,
+)
+from .options import CRASH_TILT, TrackingOptions
+
+
+class TrackingBatch:
+    """n independent flights of one task.
+
+    The public arrays are views for reading; `reset_row` and `step` change them.
+    """
+
+    def __init__(self, options: TrackingOptions, n: int) -> None:
+        self.options, self.n, self.task = options, n, options.make_task()
+        self.rows: Array = np.zeros((n, ROW_SIZE))
+        self._vector = task_vector(self.task, options.substeps, options.lost_distance)
+        self._reference: Reference = make_reference(options.reference)
+        self._disturbance: Disturbance | None = make_disturbance(options.disturbance)
+        self._randomization = options.randomization()
+        self._start, self._widths = options.start_state(), options.start_half_widths()
+        steps, dt, nodes = self.task.episode_steps, self.task.dt, 2 * options.substeps + 1
+        self._times = dt * np.arange(steps + 1 + self.task.layout.preview)
+        self._nodes = dt * (np.arange(steps)[:, None] + np.linspace(0.0, 1.0, nodes))
+        self._noise = np.repeat(np.asarray(self.task.sensor_noise), 3)
+        # A table that is the same in every episode is stored once.
+        never = np.random.default_rng(0)
+        random = (
+            self._reference.random,
+            self._disturbance is not None and self._disturbance.random,
+            bool(self._noise.any()),
+        )
+        count = [n if is_random else 1 for is_random in random]
+        self.references: Array = np.zeros((count[0], self._times.size, N_REFERENCE))
+        self.disturbances: Array = np.zeros((count[1], steps if self._disturbance else 0, nodes, 6))
+        self.noises: Array = np.zeros((count[2], steps + 1 if random[2] else 0, N_STATE))
+        if not random[0]:
+            self.references[0] = self._reference_rows(never)
+        if self._disturbance is not None and not random[1]:
+            self.disturbances[0] = self._disturbance.values(self._nodes, never)
+        self._random = random
+        self._which: NDArray[np.int64] = np.zeros((3, n), dtype=np.int64)
+        for table in range(3):
+            if random[table]:
+                self._which[table] = np.arange(n)
+        self._scratch = np.zeros(SCRATCH_SIZE)
+        self._steps = np.zeros(n, dtype=np.int64)
+
+    def reset_row(
+        self, i: int, rng: np.random.Generator, out: NDArray[np.float32], options: Mapping[str, Any] | None = None
+    ) -> None:
+        """Begin a new episode in row i and write its first observation.
+
+        Draws, in this order: start (12 uniform numbers), vehicle, reference, disturbance, sensor noise.
+
+        Args:
+            i: Row.
+            rng: The generator of this flight.
+            out: Observation, (layout.size,) float32.
+            options: `{"state": ...}` puts the plant (12 or 16 numbers) there instead of the drawn start.
+
+        Raises:
+            ValueError: If the options are unknown or the state is not a finite plant.
+        """
+        start = None if not options else self._start_from(options)
+        state = self._start + self._widths * rng.uniform(-1.0, 1.0, N_STATE)
+        vehicle, force_max = self._draw_vehicle(rng)
+        row = self.rows[i]
+        row[:] = 0.0
+        row[PLANT] = [*state, *[self.task.hover_force] * 4] if start is None else start
+        row[COMMAND] = self.task.hover_force
+        row[COEFFICIENTS], row[FORCE_MAX] = vehicle, force_max
+        if self._random[0]:
+            self.references[i] = self._reference_rows(rng)
+        if self._disturbance is not None and self._random[1]:
+            self.disturbances[i] = self._disturbance.values(self._nodes, rng)
+        if self._random[2]:
+            rng.standard_normal(out=self.noises[i])
+            self.noises[i] *= self._noise
+        observe_row(
+            self.rows, i, self.references, self.disturbances, self.noises, self._which, self._vector, self._scratch, out
+        )
+
+    def step(self, actions: NDArray[np.floating], out: NDArray[np.float32]) -> None:
+        """Move all flights by one control period and write their observations.
+
+        Args:
+            actions: (n, 4), entries in [-1, 1]; others are clipped and counted.
+            out: (n, layout.size) float32.
+
+        Raises:
+            ValueError: If an action is not finite; then no flight has moved.
+        """
+        bad = step_rows(
+            self.rows,
+            self.references,
+            self.disturbances,
+            self.noises,
+            self._which,
+            actions,
+            self._vector,
+            self._scratch,
+            self._steps,
+            out,
+        )
+        if bad >= 0:
+            where = f"[{bad}]" if self.n == 1 else f"[{bad // 4}, {bad % 4}]"
+            raise ValueError(
+                f"action{where} is {actions.reshape(-1)[bad]}; actions must be finite numbers in [-1, 1]. "
+                "The environment has not moved."
+            )
+
+    def _reference_rows(self, rng: np.random.Generator) -> Array:
+        rows = np.asarray(self._reference.rows(self._times, rng), dtype=np.float64)
+        if rows.shape != (self._times.size, N_REFERENCE):
+            raise ValueError(
+                f"reference {self._reference!r} must give rows of shape {(self._times.size, N_REFERENCE)}, "
+                f"got {rows.shape}"
+            )
+        if not np.isfinite(rows).all():
+            k = int(np.argmin(np.isfinite(rows).all(axis=1)))
+            raise ValueError(f"reference {self._reference!r} is not finite at t = {self._times[k]:g} s")
+        return rows
+
+    def _draw_vehicle(self, rng: np.random.Generator) -> tuple[Array, float]:
+        """Coefficients and rotor saturation of the true vehicle."""
+        params, kappa = self.task.params, self.task.limits.kappa
+        if self._randomization:
+            change = {
+                name: 1.0 + spread * rng.uniform(-1.0, 1.0, 3 if name == "inertia" else None)
+                for name, spread in self._randomization.items()
+            }
+            kappa *= float(change.pop("kappa", 1.0))
+            inertia = np.asarray(params.inertia) * change.pop("inertia", 1.0)
+            scaled = {name: getattr(params, name) * float(factor) for name, factor in change.items()}
+            params = replace(params, inertia=tuple(inertia.tolist()), **scaled)
+        return params.coefficients(), kappa * self.task.params.weight
+
+    def _start_from(self, options: Mapping[str, Any]) -> Array:
+        unknown = sorted(set(options) - {"state"})
+        if unknown:
+            raise ValueError(f"unknown reset option {unknown[0]!r}; known: 'state' (12 or 16 numbers)")
+        state = np.asarray(options["state"], dtype=np.float64)
+        if state.shape not in ((12,), (16,)) or not np.isfinite(state).all():
+            raise ValueError(f"reset option 'state' must be 12 or 16 finite numbers, got {options['state']!r}")
+        if max(abs(state[6]), abs(state[7])) >= CRASH_TILT:
+            raise ValueError(
+                f"reset option 'state': roll and pitch must be below {math.degrees(CRASH_TILT):.0f} deg, "
+                f"got {state[6:8].tolist()} rad"
+            )
+        return state if state.size == 16 else np.concatenate([state, np.full(4, self.task.hover_force)])

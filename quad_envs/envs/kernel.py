@@ -1,0 +1,232 @@
+"""The compiled step of the tracking task: actions in, observations and the reward out, for any number of vehicles.
+
+Each vehicle is one row of a float64 array. The single environment is a batch of one row, so that both environments
+are the same computation by construction; blocks of LANES rows only let the integrator's loops vectorise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .._numba import inline_kernel, kernel
+from ..constraints import POSITION_SCALE, TILT_SCALE, TOLERANCE, VELOCITY_SCALE, force_from_action
+from ..dynamics import LANES, SCRATCH_ROWS, advance, load_vehicle, store_vehicle
+from ..observations import N_OWN, N_REFERENCE, encode_own, encode_preview
+from ..parameters import N_COEFFICIENTS, Array
+from ..reward import stage_cost_kernel
+from ..tasks import Task
+from .options import CRASH_TILT
+
+# Entries of a vehicle's row.
+PLANT = slice(0, 16)  # [p, V_B, Theta, Omega, F]
+COMMAND = slice(16, 20)  # last rotor commands, N
+COEFFICIENTS = slice(20, 20 + N_COEFFICIENTS)  # of the true vehicle
+FORCE_MAX = 34  # rotor saturation of the true vehicle, N
+REWARD, STAGE_COST, COST, EPISODE_COST, VIOLATED, CRASHED, TRUNCATED, CLIPPED, STEP = range(35, 44)
+VALUES = 44  # constraint values, one per named row, at most four
+ROW_SIZE = 48
+SCRATCH_SIZE = SCRATCH_ROWS * LANES + 4 * LANES + 16  # integrator, previous commands, one measured plant
+
+# Entries of the task vector.
+_DT, _SUBSTEPS, _HOVER, _ACTION_MAX, _EPISODE_STEPS, _PREVIEW, _QUADRATIC, _LOST = range(8)
+_SEES_POSITION, _SEES_DISTURBANCE, _TILT, _VELOCITY, _HAS_POSITION, _RATE_STEP, _CRASH_TILT = range(8, 15)
+_LOWER = slice(15, 18)
+_UPPER = slice(18, 21)
+_Q = slice(21, 33)
+_R = slice(33, 37)
+
+_BLOCK_FROM = 8  # rows from which a block of lanes is faster than one row at a time
+
+
+def task_vector(task: Task, substeps: int, lost_distance: float) -> Array:
+    """The task in the form that the kernels read."""
+    limits = task.limits
+    return np.array(
+        [
+            task.dt,
+            substeps,
+            task.hover_force,
+            task.force_max,
+            task.episode_steps,
+            task.layout.preview,
+            task.reward == "quadratic",
+            lost_distance,
+            task.layout.position,
+            task.layout.disturbance,
+            limits.tilt,
+            limits.velocity,
+            limits.has_position,
+            limits.rate * task.dt,
+            CRASH_TILT,
+            *limits.position_lower,
+            *limits.position_upper,
+            *task.weights.Q,
+            *task.weights.R,
+        ],
+        dtype=np.float64,
+    )
+
+
+@inline_kernel
+def _hinge(row, index, value, scale):  # type: ignore[no-untyped-def]
+    """Record one constraint value; its share of the cost where it is violated."""
+    row[VALUES + index] = value
+    return value / scale if value > TOLERANCE else 0.0
+
+
+@kernel
+def _violation_cost(row, previous, task):  # type: ignore[no-untyped-def]
+    """Sum of hinge / scale over the limits, `constraints.constraint_values` in compiled form."""
+    index, cost = 0, 0.0
+    if task[_TILT] < np.inf:
+        cost += _hinge(row, index, max(abs(row[6]), abs(row[7])) - task[_TILT], TILT_SCALE)
+        index += 1
+    if task[_VELOCITY] < np.inf:
+        speed = max(abs(row[3]), max(abs(row[4]), abs(row[5])))
+        cost += _hinge(row, index, speed - task[_VELOCITY], VELOCITY_SCALE)
+        index += 1
+    if task[_HAS_POSITION] > 0.0:
+        outside = -np.inf
+        for i in range(3):
+            outside = max(outside, max(task[_LOWER][i] - row[i], row[i] - task[_UPPER][i]))
+        cost += _hinge(row, index, outside, POSITION_SCALE)
+        index += 1
+    if task[_RATE_STEP] < np.inf:
+        change = 0.0
+        for i in range(4):
+            change = max(change, abs(row[COMMAND][i] - previous[i]))
+        cost += _hinge(row, index, change - task[_RATE_STEP], task[_RATE_STEP])
+    return cost
+
+
+@kernel
+def _judge(row, reference, previous, finite, task):  # type: ignore[no-untyped-def]
+    """Stage cost, violation, crash and reward of a row after its step; `reference` is the row at the new time."""
+    off = 0.0
+    for i in range(3):
+        off += (row[i] - reference[i]) ** 2
+    crashed = (
+        not finite
+        or abs(row[6]) >= task[_CRASH_TILT]
+        or abs(row[7]) >= task[_CRASH_TILT]
+        or off > task[_LOST] * task[_LOST]
+    )
+    stage_cost = stage_cost_kernel(row, reference, row[COMMAND], task[_HOVER], task[_Q], task[_R])
+    cost = _violation_cost(row, previous, task)
+    v = min(1.0, cost)
+    if task[_QUADRATIC] > 0.0:
+        row[REWARD] = -stage_cost - v
+    else:
+        row[REWARD] = 0.0 if crashed else (1.0 - v) / (1.0 + stage_cost)
+    row[STAGE_COST] = stage_cost
+    row[COST] = cost
+    row[EPISODE_COST] += cost
+    row[VIOLATED] = 1.0 if cost > 0.0 else 0.0
+    row[CRASHED] = 1.0 if crashed else 0.0
+    row[TRUNCATED] = 1.0 if row[STEP] >= task[_EPISODE_STEPS] and not crashed else 0.0
+
+
+@kernel
+def observe(row, reference, disturbance, noise, task, measured, out):  # type: ignore[no-untyped-def]
+    """Write the observation of a row.
+
+    Args:
+        row: The vehicle.
+        reference: Its reference table, (n_steps, 8).
+        disturbance: Its disturbance table, (n_steps, n_nodes, 6).
+        noise: Its measurement errors, (n_steps, 12); no steps for none.
+        task: Task vector.
+        measured: Scratch, (16,).
+        out: (layout.size,) float32.
+    """
+    k = int(row[STEP])
+    for i in range(16):
+        measured[i] = row[i]
+    if noise.shape[0] > 0:
+        for i in range(12):
+            measured[i] += noise[min(k, noise.shape[0] - 1), i]
+    encode_own(out, measured, row[COMMAND])
+    start = N_OWN
+    if task[_SEES_POSITION] > 0.0:
+        for i in range(3):
+            out[start + i] = measured[i]
+        start += 3
+    if task[_SEES_DISTURBANCE] > 0.0:
+        for i in range(6):
+            out[start + i] = 0.0
+        if 0 < disturbance.shape[0] and k < disturbance.shape[0]:
+            for i in range(6):
+                out[start + i] = disturbance[k, disturbance.shape[1] // 2, i]
+        start += 6
+    encode_preview(out, start, reference, k, int(task[_PREVIEW]) + 1, measured)
+
+
+@inline_kernel
+def _command(row, actions, task):  # type: ignore[no-untyped-def]
+    """Take an action over into the row; entries outside [-1, 1] are clipped and counted."""
+    for i in range(4):
+        action = np.float64(actions[i])
+        if action < -1.0 or action > 1.0:
+            row[CLIPPED] += 1.0
+            action = min(max(action, -1.0), 1.0)
+        row[COMMAND][i] = force_from_action(action, task[_HOVER], task[_ACTION_MAX])
+
+
+@kernel
+def step_rows(rows, references, disturbances, noises, which, actions, task, scratch, steps, out):  # type: ignore[no-untyped-def]
+    """One control period of every row.
+
+    Args:
+        rows: (n, ROW_SIZE), modified in place.
+        references: Tables (n_tables, n_steps, 8).
+        disturbances: Tables (n_tables, n_steps, 2 substeps + 1, 6); no steps for none.
+        noises: Tables (n_tables, n_steps, 12); no steps for none.
+        which: Reference, disturbance and noise table of each row, (3, n) int64.
+        actions: (n, 4).
+        task: Task vector.
+        scratch: (SCRATCH_SIZE,).
+        steps: Scratch, (n,) int64.
+        out: Observations, (n, layout.size) float32.
+
+    Returns:
+        -1, or the flat index of the first non-finite action; then nothing was changed.
+    """
+    n = rows.shape[0]
+    for i in range(n):
+        for a in range(4):
+            if not np.isfinite(actions[i, a]):
+                return 4 * i + a
+    substeps = int(task[_SUBSTEPS])
+    h = task[_DT] / substeps
+    stride = np.int64(LANES) if n >= _BLOCK_FROM else np.int64(1)
+    measured = scratch[scratch.size - 16 :]
+    previous = scratch[scratch.size - 16 - 4 * LANES : scratch.size - 16].reshape(LANES, 4)
+    for first in range(0, n, stride):
+        lanes = min(stride, n - first)
+        for j in range(lanes):
+            row = rows[first + j]
+            for a in range(4):
+                previous[j, a] = row[COMMAND][a]
+            _command(row, actions[first + j], task)
+            steps[first + j] = int(row[STEP])
+            load_vehicle(scratch, j, stride, row, row[COMMAND], row[FORCE_MAX], row[COEFFICIENTS], h)
+        advance(scratch, stride, lanes, substeps, h, disturbances, which[1, first:], steps[first:])
+        for j in range(lanes):
+            i = first + j
+            row = rows[i]
+            finite = store_vehicle(scratch, j, stride, row)
+            row[STEP] += 1.0
+            reference = references[which[0, i]]
+            k = min(int(row[STEP]), reference.shape[0] - 1)
+            _judge(row, reference[k], previous[j], finite, task)
+            observe(row, reference, disturbances[which[1, i]], noises[which[2, i]], task, measured, out[i])
+    return -1
+
+
+@kernel
+def observe_row(rows, i, references, disturbances, noises, which, task, scratch, out):  # type: ignore[no-untyped-def]
+    """Observation of row i as it stands, after a reset; also its stage cost, with no command change yet."""
+    row = rows[i]
+    reference = references[which[0, i]]
+    _judge(row, reference[int(row[STEP])], row[COMMAND], True, task)
+    observe(row, reference, disturbances[which[1, i]], noises[which[2, i]], task, scratch[scratch.size - 16 :], out)

@@ -1,0 +1,194 @@
+"""Many quadrotors follow references at once: the native vector environment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from ..constraints import constraint_names
+from ..parameters import Array
+from ..tasks import Task
+from .batch import TrackingBatch
+from .kernel import (
+    CLIPPED,
+    COST,
+    CRASHED,
+    EPISODE_COST,
+    PLANT,
+    REWARD,
+    STAGE_COST,
+    TRUNCATED,
+    VALUES,
+    VIOLATED,
+)
+from .options import TrackingOptions
+
+Observations = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+_Step = tuple[Observations, Array, Bools, Bools, dict[str, Any]]
+
+
+class TrackingVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]):
+    """n tracking tasks stepped in one compiled call, equal row by row to n `TrackingEnv` with the same seeds.
+
+    Args:
+        num_envs: Number of flights.
+        autoreset_mode: Gymnasium's NEXT_STEP (default), SAME_STEP or DISABLED.
+        max_episode_steps: From `gymnasium.make_vec`; shortens the task's time limit.
+        render_mode: None.
+        kwargs: As for `TrackingEnv`.
+
+    Raises:
+        ValueError: If num_envs < 1 or an argument is not valid.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+        **kwargs: Any,
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be >= 1, got {num_envs!r}")
+        if render_mode is not None:
+            raise ValueError(f"render_mode must be None, got {render_mode!r}")
+        options = TrackingOptions.from_kwargs(kwargs)
+        if max_episode_steps is not None:
+            limit = min(options.time_limit, max_episode_steps * options.dt)
+            options = TrackingOptions.from_kwargs({**kwargs, "time_limit": limit})
+        self.num_envs, self.render_mode = num_envs, render_mode
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {"render_modes": [], "render_fps": 20, "autoreset_mode": self.autoreset_mode}
+        self._batch = TrackingBatch(options, num_envs)
+        self._n_values = len(constraint_names(self.task.limits))
+        self.single_action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
+        self.single_observation_space = spaces.Box(-np.inf, np.inf, (self.task.layout.size,), np.float32)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._generators: list[np.random.Generator] = []
+        self._done = np.zeros(num_envs, dtype=np.bool_)
+
+    @property
+    def task(self) -> Task:
+        """What is known of the task before the flight."""
+        return self._batch.task
+
+    @property
+    def state(self) -> Array:
+        """Copy of the plant states [p, V_B, Theta, Omega, F], (n, 16). For study and tests."""
+        return self._batch.rows[:, PLANT].copy()
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Begin episodes: in all rows, or in those of `options["reset_mask"]` (bool, (n,)).
+
+        Args:
+            seed: One number s (row i gets s + i), one per row, or None to draw on.
+            options: `{"state": x}` sets the plants, 12 or 16 numbers for all or one such row for each.
+        """
+        given = dict(options or {})
+        mask = np.asarray(given.pop("reset_mask", np.ones(self.num_envs)), dtype=np.bool_)
+        if mask.shape != (self.num_envs,):
+            raise ValueError(f"reset_mask must have shape ({self.num_envs},), got {mask.shape}")
+        self._seed(seed, mask)
+        state = np.asarray(given.pop("state")) if "state" in given else None
+        observations = self._fresh_observations()
+        for i in range(self.num_envs):
+            if mask[i]:
+                one = dict(given) if state is None else {**given, "state": state if state.ndim == 1 else state[i]}
+                self._batch.reset_row(i, self._generators[i], observations[i], one)
+            else:
+                observations[i] = self._last[i]
+        self._done[mask] = False
+        self._last = observations if self.autoreset_mode is not AutoresetMode.DISABLED else observations.copy()
+        return observations, self._info()
+
+    def step(self, actions: NDArray[np.float32]) -> _Step:
+        """Hold the rotor commands of all flights over one control period."""
+        actions = np.ascontiguousarray(actions, dtype=np.float32)
+        if actions.shape != (self.num_envs, 4):
+            raise ValueError(f"actions must have shape ({self.num_envs}, 4), got {actions.shape}")
+        if not self._generators:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        finished = self._done
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP and finished.any():
+            actions = np.where(finished[:, None], np.float32(0.0), actions)
+        observations = self._fresh_observations()
+        self._batch.step(actions, observations)
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+            self._reset_rows(finished, observations)
+        rows = self._batch.rows
+        rewards = rows[:, REWARD].copy()
+        terminated, truncated = rows[:, CRASHED] > 0.0, rows[:, TRUNCATED] > 0.0
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+            rewards[finished] = 0.0
+        self._done = terminated | truncated
+        info = self._info()
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and self._done.any():
+            info = self._reset_in_same_step(observations, info)
+        elif self.autoreset_mode is AutoresetMode.DISABLED:
+            self._last = observations.copy()
+        return observations, rewards, terminated, truncated, info
+
+    def _reset_rows(self, which: Bools, observations: Observations) -> None:
+        for i in np.flatnonzero(which):
+            self._batch.reset_row(int(i), self._generators[i], observations[i])
+
+    def _reset_in_same_step(self, observations: Observations, info: dict[str, Any]) -> dict[str, Any]:
+        """Begin anew where an episode ended; what was before travels in `final_obs` and `final_info`."""
+        done = self._done
+        final = np.full(self.num_envs, None, dtype=object)
+        for i in np.flatnonzero(done):
+            final[i] = observations[i].copy()
+        self._reset_rows(done, observations)
+        fresh = self._info()
+        fresh["final_obs"], fresh["_final_obs"] = final, done.copy()
+        last = {key: value.copy() for key, value in info.items() if not key.startswith("_")}
+        fresh["final_info"] = last | {f"_{key}": done.copy() for key in last}
+        fresh["_final_info"] = done.copy()
+        return fresh
+
+    def _seed(self, seed: int | Sequence[int | None] | None, mask: Bools) -> None:
+        if seed is None and self._generators:
+            return
+        if seed is None or isinstance(seed, int | np.integer):
+            seeds: Sequence[int | None] = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
+        else:
+            seeds = seed
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seed must be one number or {self.num_envs} of them, got {len(seeds)}")
+        fresh = [seeding.np_random(value)[0] for value in seeds]
+        if not self._generators:
+            self._generators = fresh
+        for i in np.flatnonzero(mask):
+            if seeds[i] is not None:
+                self._generators[i] = fresh[i]
+
+    def _fresh_observations(self) -> Observations:
+        return np.empty((self.num_envs, self.task.layout.size), dtype=np.float32)
+
+    def _info(self) -> dict[str, Any]:
+        rows = self._batch.rows
+        info: dict[str, Any] = {
+            "cost": rows[:, COST].copy(),
+            "episode_cost": rows[:, EPISODE_COST].copy(),
+            "constraint_violation": rows[:, VIOLATED] > 0.0,
+            "constraint_values": rows[:, VALUES : VALUES + self._n_values].copy(),
+            "stage_cost": rows[:, STAGE_COST].copy(),
+            "crashed": rows[:, CRASHED] > 0.0,
+            "clipped_actions": rows[:, CLIPPED].astype(np.int64),
+        }
+        present = np.ones(self.num_envs, dtype=np.bool_)
+        return info | {f"_{key}": present.copy() for key in info}

@@ -1,0 +1,32 @@
+"""The table of ids: each is one environment class with its default keyword arguments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+
+_ENTRY = "quad_envs.envs.tracking:TrackingEnv"
+_VECTOR_ENTRY = "quad_envs.envs.tracking_vector:TrackingVectorEnv"
+
+# Defaults of each tracking id; any keyword argument of TrackingEnv overrides them in `gymnasium.make`.
+TRACKING: dict[str, dict[str, Any]] = {
+    "quad/Regulation-v0": {"reference": "setpoint", "start_box": 3.0},
+    "quad/HelixTracking-v0": {"reference": "helix"},
+    "quad/SpiralTracking-v0": {"reference": "spiral"},
+    "quad/LineTracking-v0": {"reference": "lines"},
+    "quad/LemniscateTracking-v0": {"reference": "lemniscate"},
+    "quad/RandomTracking-v0": {"reference": "random"},
+}
+
+
+def register() -> None:
+    """Register every id with Gymnasium; calling it again changes nothing."""
+    for env_id, defaults in TRACKING.items():
+        if env_id not in gymnasium.registry:
+            gymnasium.register(
+                env_id,
+                entry_point=_ENTRY,
+                vector_entry_point=_VECTOR_ENTRY,
+                kwargs={"env_id": env_id, **defaults},
+            )

@@ -1,0 +1,89 @@
+"""THE reward: one bounded formula for every task and every policy, monotone step by step in the MPCs' stage cost.
+
+    reward = (1 - v) / (1 + l),   l = |x - x_ref|_Q^2 + |u - u_T|_R^2,   v = min(1, sum_j hinge_j / scale_j)
+
+It is positive while the vehicle flies within its limits and a crash ends the episode, so that crashing early is never
+better than flying badly. x_ref = [p_ref; R_BI v_ref; 0, 0, psi_ref; 0]: the velocity error is the inertial one, seen
+in body axes; the yaw error is wrapped.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ._numba import inline_kernel
+from .parameters import Array, Weights
+from .rotations import rotation_body_from_inertial, sincos, wrap_angle, wrap_angle_scalar
+
+
+@inline_kernel
+def stage_cost_kernel(x, row, command, hover, Q, R):  # type: ignore[no-untyped-def]
+    """The stage cost l of one vehicle.
+
+    Args:
+        x: State, (>= 12,).
+        row: Reference row, (8,).
+        command: Rotor commands, (4,), N.
+        hover: u_T, N.
+        Q: Diagonal, (12,).
+        R: Diagonal, (4,).
+
+    Returns:
+        l >= 0.
+    """
+    sf, cf = sincos(x[6])
+    st, ct = sincos(x[7])
+    ss, cs = sincos(x[8])
+    vx, vy, vz = row[3], row[4], row[5]
+    forward = cs * vx + ss * vy  # the reference velocity in the heading frame
+    right = cs * vy - ss * vx
+    e3 = x[3] - (ct * forward - st * vz)
+    e4 = x[4] - (sf * (st * forward + ct * vz) + cf * right)
+    e5 = x[5] - (cf * (st * forward + ct * vz) - sf * right)
+    e8 = wrap_angle_scalar(x[8] - np.arctan2(row[6], row[7]))
+    cost = Q[3] * e3 * e3 + Q[4] * e4 * e4 + Q[5] * e5 * e5
+    cost += Q[6] * x[6] * x[6] + Q[7] * x[7] * x[7] + Q[8] * e8 * e8
+    for i in range(3):
+        e = x[i] - row[i]
+        cost += Q[i] * e * e + Q[9 + i] * x[9 + i] * x[9 + i]
+    for i in range(4):
+        du = command[i] - hover
+        cost += R[i] * du * du
+    return cost
+
+
+def tracking_error(x: ArrayLike, rows: ArrayLike) -> Array:
+    """x - x_ref of the reward, the error whose weighted square is the stage cost.
+
+    Args:
+        x: States, (..., >= 12).
+        rows: Reference rows, (..., 8).
+
+    Returns:
+        (..., 12).
+    """
+    x, rows = np.asarray(x, dtype=np.float64)[..., :12], np.asarray(rows, dtype=np.float64)
+    error = x.copy()
+    error[..., 0:3] -= rows[..., 0:3]
+    error[..., 3:6] -= np.einsum("...ij,...j->...i", rotation_body_from_inertial(x[..., 6:9]), rows[..., 3:6])
+    error[..., 8] = wrap_angle(x[..., 8] - np.arctan2(rows[..., 6], rows[..., 7]))
+    return error
+
+
+def stage_cost(x: ArrayLike, rows: ArrayLike, command: ArrayLike, hover: float, weights: Weights) -> Array:
+    """The stage cost l on arrays, readable twin of `stage_cost_kernel`.
+
+    Args:
+        x: States, (..., >= 12).
+        rows: Reference rows, (..., 8).
+        command: Rotor commands, (..., 4), N.
+        hover: u_T, N.
+        weights: Q and R.
+
+    Returns:
+        (...).
+    """
+    du = np.asarray(command, dtype=np.float64) - hover
+    error = tracking_error(x, rows)
+    return np.asarray((error * error) @ np.asarray(weights.Q) + (du * du) @ np.asarray(weights.R))
