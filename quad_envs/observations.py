@@ -135,10 +135,13 @@ def encode_own(out, plant, command):  # type: ignore[no-untyped-def]
 
 @inline_kernel
 def encode_preview(out, start, reference, row, stages, p):  # type: ignore[no-untyped-def]
-    """Write reference rows row..row+stages-1, positions relative to p, from out[start] on."""
+    """Write reference rows row..row+stages-1 from out[start] on, positions relative to p."""
+    rows = reference[row : row + stages].reshape(-1)
+    target = out[start : start + N_REFERENCE * stages]
+    for i in range(N_REFERENCE * stages):  # one long loop, which vectorises
+        target[i] = rows[i]
     for q in range(stages):
-        o = start + 8 * q
-        for i in range(3):
-            out[o + i] = reference[row + q, i] - p[i]
-        for i in range(3, 8):
-            out[o + i] = reference[row + q, i]
+        o = N_REFERENCE * q
+        target[o] = rows[o] - p[0]
+        target[o + 1] = rows[o + 1] - p[1]
+        target[o + 2] = rows[o + 2] - p[2]

@@ -23,6 +23,7 @@ COMMAND = slice(16, 20)  # last rotor commands, N
 COEFFICIENTS = slice(20, 20 + N_COEFFICIENTS)  # of the true vehicle
 FORCE_MAX = 34  # rotor saturation of the true vehicle, N
 REWARD, STAGE_COST, COST, EPISODE_COST, VIOLATED, CRASHED, TRUNCATED, CLIPPED, STEP = range(35, 44)
+SCORES = slice(35, 44)  # these nine
 VALUES = 44  # constraint values, one per named row, at most four
 ROW_SIZE = 48
 SCRATCH_SIZE = SCRATCH_ROWS * LANES + 4 * LANES + 16  # integrator, previous commands, one measured plant

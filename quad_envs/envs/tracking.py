@@ -13,21 +13,12 @@ from ..constraints import constraint_names
 from ..parameters import Array
 from ..tasks import Task
 from .batch import TrackingBatch
-from .kernel import (
-    CLIPPED,
-    COST,
-    CRASHED,
-    EPISODE_COST,
-    PLANT,
-    REWARD,
-    STAGE_COST,
-    TRUNCATED,
-    VALUES,
-    VIOLATED,
-)
+from .kernel import PLANT, SCORES, VALUES
 from .options import TrackingOptions
 
 Observation = NDArray[np.float32]
+
+_REWARD, _STAGE_COST, _COST, _EPISODE_COST, _VIOLATED, _CRASHED, _TRUNCATED, _CLIPPED = range(8)  # within SCORES
 
 
 class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -88,11 +79,24 @@ class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             raise ValueError(f"render_mode must be None, got {render_mode!r}")
         self.render_mode = render_mode
         self._batch = TrackingBatch(TrackingOptions.from_kwargs(kwargs), 1)
-        self._row = self._batch.rows[0]
-        self._n_values = len(constraint_names(self.task.limits))
-        self._size = self.task.layout.size
+        self._bind()
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.observation_space = spaces.Box(-np.inf, np.inf, (self._size,), np.float32)
+
+    def _bind(self) -> None:
+        """Views of the batch's only row, made once because slicing takes longer than reading."""
+        row = self._batch.rows[0]
+        self._scores, self._plant = row[SCORES], row[PLANT]
+        self._values = row[VALUES : VALUES + len(constraint_names(self.task.limits))]
+        self._size = self.task.layout.size
+
+    def __getstate__(self) -> dict[str, Any]:
+        views = ("_scores", "_plant", "_values", "_size")
+        return {key: value for key, value in self.__dict__.items() if key not in views}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._bind()
 
     @property
     def task(self) -> Task:
@@ -102,7 +106,7 @@ class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     @property
     def state(self) -> Array:
         """Copy of the plant state [p, V_B, Theta, Omega, F], (16,). For study and tests; policies never see it."""
-        return self._row[PLANT].copy()
+        return self._plant.copy()
 
     @property
     def reference(self) -> Array:
@@ -116,7 +120,7 @@ class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         super().reset(seed=seed)
         observation = np.empty(self._size, dtype=np.float32)
         self._batch.reset_row(0, self.np_random, observation, options)
-        return observation, self._info(self._row.tolist())
+        return observation, self._info(self._scores.tolist())
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Hold the rotor commands over one control period."""
@@ -125,16 +129,16 @@ class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             raise ValueError(f"action must have shape (4,), one entry per rotor, got {actions.shape}")
         observation = np.empty(self._size, dtype=np.float32)
         self._batch.step(actions.reshape(1, 4), observation.reshape(1, -1))
-        row = self._row.tolist()
-        return observation, row[REWARD], row[CRASHED] > 0.0, row[TRUNCATED] > 0.0, self._info(row)
+        scores = self._scores.tolist()
+        return observation, scores[_REWARD], scores[_CRASHED] > 0.0, scores[_TRUNCATED] > 0.0, self._info(scores)
 
-    def _info(self, row: list[float]) -> dict[str, Any]:
+    def _info(self, scores: list[float]) -> dict[str, Any]:
         return {
-            "cost": row[COST],
-            "episode_cost": row[EPISODE_COST],
-            "constraint_violation": row[VIOLATED] > 0.0,
-            "constraint_values": self._row[VALUES : VALUES + self._n_values].copy(),
-            "stage_cost": row[STAGE_COST],
-            "crashed": row[CRASHED] > 0.0,
-            "clipped_actions": int(row[CLIPPED]),
+            "cost": scores[_COST],
+            "episode_cost": scores[_EPISODE_COST],
+            "constraint_violation": scores[_VIOLATED] > 0.0,
+            "constraint_values": self._values.copy(),
+            "stage_cost": scores[_STAGE_COST],
+            "crashed": scores[_CRASHED] > 0.0,
+            "clipped_actions": int(scores[_CLIPPED]),
         }
