@@ -37,7 +37,11 @@ class _Announcer(event.Listener):  # type: ignore[misc]
         module = event.data["dispatcher"].py_func.__module__
         if not self.said and module.split(".")[0] in _PACKAGES:
             self.said = True
-            print("quad_envs: compiling kernels, once per installation (a few seconds) ...", file=sys.stderr, flush=True)
+            print(
+                "quad_envs: compiling kernels, once per installation (a few seconds) ...",
+                file=sys.stderr,
+                flush=True,
+            )
 
     def on_end(self, event: Any) -> None:
         """Nothing to say when it ends."""

@@ -30,7 +30,9 @@ def constraint_names(limits: Limits) -> tuple[str, ...]:
     return tuple(name for name, present in rows if present)
 
 
-def constraint_values(plant: ArrayLike, command: ArrayLike, previous: ArrayLike, limits: Limits, dt: float) -> Array:
+def constraint_values(
+    plant: ArrayLike, command: ArrayLike, previous: ArrayLike, limits: Limits, dt: float
+) -> Array:
     """Value minus limit of each row, in SI units; positive means violated. Readable twin of the environments' kernel.
 
     Args:
@@ -59,7 +61,12 @@ def constraint_values(plant: ArrayLike, command: ArrayLike, previous: ArrayLike,
 
 def constraint_scales(limits: Limits, dt: float) -> Array:
     """Violation of each row that costs the whole reward of a step, (number of rows,)."""
-    scale = {"tilt": TILT_SCALE, "velocity": VELOCITY_SCALE, "position": POSITION_SCALE, "rate": limits.rate * dt}
+    scale = {
+        "tilt": TILT_SCALE,
+        "velocity": VELOCITY_SCALE,
+        "position": POSITION_SCALE,
+        "rate": limits.rate * dt,
+    }
     return np.array([scale[name] for name in constraint_names(limits)])
 
 

@@ -98,7 +98,9 @@ class Gusts:
 
     def __post_init__(self) -> None:
         if self.force < 0.0 or self.torque < 0.0:
-            raise ValueError(f"gust deviations must be >= 0, got force {self.force!r} N, torque {self.torque!r} N m")
+            raise ValueError(
+                f"gust deviations must be >= 0, got force {self.force!r} N, torque {self.torque!r} N m"
+            )
         if not self.correlation_time > 0.0:
             raise ValueError(f"correlation_time must be > 0 s, got {self.correlation_time!r}")
 

@@ -84,7 +84,11 @@ def rigid_body(x, F, d, c):  # type: ignore[no-untyped-def]
         r13 * u + r23 * v + r33 * w,
         r * v - q * w + (r11 * fx + r12 * fy + r13 * fz) - c[DRAG_RATE] * u,
         p * w - r * u + (r21 * fx + r22 * fy + r23 * fz) - c[DRAG_RATE] * v,
-        q * u - p * v + (r31 * fx + r32 * fy + r33 * fz) - c[DRAG_RATE] * w - (F[0] + F[1] + F[2] + F[3]) * c[INV_MASS],
+        q * u
+        - p * v
+        + (r31 * fx + r32 * fy + r33 * fz)
+        - c[DRAG_RATE] * w
+        - (F[0] + F[1] + F[2] + F[3]) * c[INV_MASS],
         p + st * turn,
         cf * q - sf * r,
         turn,
@@ -126,7 +130,9 @@ def derivative_reference(
         - params.drag / params.mass * V_B
     )
     out[..., ATTITUDE] = np.einsum("...ij,...j->...i", euler_rate_matrix(Theta), Omega)
-    out[..., RATES] = (-np.cross(Omega, J * Omega) + T_tau[..., 1:] + np.asarray(torque, dtype=np.float64)) / J
+    out[..., RATES] = (
+        -np.cross(Omega, J * Omega) + T_tau[..., 1:] + np.asarray(torque, dtype=np.float64)
+    ) / J
     return out
 
 
@@ -202,7 +208,7 @@ def _stage(w, stride, decay_row, weight, ahead):  # type: ignore[no-untyped-def]
 
 @kernel
 def _finish_substep(w, stride, sixth):  # type: ignore[no-untyped-def]
-    """x <- x + h/6 (k1 + 2 k2 + 2 k3 + k4); the rotor forces move on by a whole substep."""
+    """X <- x + h/6 (k1 + 2 k2 + 2 k3 + k4); the rotor forces move on by a whole substep."""
     for i in range(N_STATE):
         for o in range(i * stride, (i + 1) * stride):
             moved = w[o + _X * stride] + sixth * w[o + _ACC * stride]
@@ -212,7 +218,9 @@ def _finish_substep(w, stride, sixth):  # type: ignore[no-untyped-def]
     for i in range(N_INPUT):
         for j in range(stride):
             o = i * stride + j
-            w[o + _F * stride] = _lagged(w[o + _F * stride], w[o + _CMD * stride], w[_DECAY_WHOLE * stride + j])
+            w[o + _F * stride] = _lagged(
+                w[o + _F * stride], w[o + _CMD * stride], w[_DECAY_WHOLE * stride + j]
+            )
 
 
 @kernel
@@ -332,7 +340,9 @@ def simulate(
     """
     start = np.asarray(plant, dtype=np.float64)
     plants = np.array(start.reshape(-1, N_STATE + N_INPUT))
-    commands = np.ascontiguousarray(np.broadcast_to(np.asarray(command, dtype=np.float64), (*start.shape[:-1], N_INPUT)))
+    commands = np.ascontiguousarray(
+        np.broadcast_to(np.asarray(command, dtype=np.float64), (*start.shape[:-1], N_INPUT))
+    )
     _simulate(
         plants,
         commands.reshape(-1, N_INPUT),

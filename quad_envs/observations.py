@@ -57,7 +57,14 @@ class TrackingLayout:
     @property
     def slices(self) -> dict[str, slice]:
         """Name -> slice of the flat observation; the parts of `own` are named, too."""
-        parts = [("V_B", 3), ("phi_theta", 2), ("sin_cos_psi", 2), ("Omega", 3), ("F", 4), ("last_command", 4)]
+        parts = [
+            ("V_B", 3),
+            ("phi_theta", 2),
+            ("sin_cos_psi", 2),
+            ("Omega", 3),
+            ("F", 4),
+            ("last_command", 4),
+        ]
         if self.position:
             parts.append(("position", 3))
         if self.disturbance:
@@ -93,7 +100,9 @@ class TrackingLayout:
         """
         obs = np.asarray(observation, dtype=np.float64)
         if obs.shape[-1:] != (self.size,):
-            raise ValueError(f"observation must have {self.size} entries on its last axis, got shape {obs.shape}")
+            raise ValueError(
+                f"observation must have {self.size} entries on its last axis, got shape {obs.shape}"
+            )
         part = {name: obs[..., where] for name, where in self.slices.items()}
         psi = np.arctan2(part["sin_cos_psi"][..., :1], part["sin_cos_psi"][..., 1:])
         zero = np.zeros((*obs.shape[:-1], 6))

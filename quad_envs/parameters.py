@@ -77,7 +77,7 @@ class QuadrotorParams:
 
     @property
     def weight(self) -> float:
-        """m g, N."""
+        """M g, N."""
         return self.mass * self.gravity
 
     @property

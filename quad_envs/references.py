@@ -143,7 +143,9 @@ class RandomSmooth:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.rate_min <= self.rate_max:
-            raise ValueError(f"need 0 < rate_min <= rate_max, got {self.rate_min!r} and {self.rate_max!r} rad/s")
+            raise ValueError(
+                f"need 0 < rate_min <= rate_max, got {self.rate_min!r} and {self.rate_max!r} rad/s"
+            )
         if self.harmonics < 1:
             raise ValueError(f"harmonics must be >= 1, got {self.harmonics!r}")
 
@@ -283,16 +285,22 @@ def from_csv(path: str | Path, *, max_gap: float = 1.0) -> Reference:
             f"{path}: the header must name {', '.join(_CSV_COLUMNS[:4])} (and may name {', '.join(_CSV_COLUMNS[4:])}); "
             f"missing {missing}, unknown {unknown}"
         )
-    table = np.array([_parse_csv_line(path, number, names, line) for number, line in enumerate(lines[1:], 2) if line])
+    table = np.array(
+        [_parse_csv_line(path, number, names, line) for number, line in enumerate(lines[1:], 2) if line]
+    )
     if table.shape[0] < 2:
         raise ValueError(f"{path}: a trajectory needs at least two lines, got {table.shape[0]}")
     column = {name: table[:, i] for i, name in enumerate(names)}
     step = np.diff(column["t"])
     if (step <= 0.0).any():
-        raise ValueError(f"{path}, line {int(np.argmax(step <= 0.0)) + 3}: time must increase from line to line")
+        raise ValueError(
+            f"{path}, line {int(np.argmax(step <= 0.0)) + 3}: time must increase from line to line"
+        )
     if (step > max_gap).any():
         i = int(np.argmax(step > max_gap))
-        raise ValueError(f"{path}, line {i + 3}: a gap of {step[i]:g} s is longer than max_gap = {max_gap:g} s")
+        raise ValueError(
+            f"{path}, line {i + 3}: a gap of {step[i]:g} s is longer than max_gap = {max_gap:g} s"
+        )
     p = np.stack([column[axis] for axis in "xyz"], axis=1)
     given = [name in names for name in ("vx", "vy", "vz")]
     if any(given) and not all(given):
@@ -308,7 +316,9 @@ def from_csv(path: str | Path, *, max_gap: float = 1.0) -> Reference:
 
 def _parse_csv_line(path: str | Path, number: int, names: list[str], line: list[str]) -> list[float]:
     if len(line) != len(names):
-        raise ValueError(f"{path}, line {number}: {len(line)} cells where the header names {len(names)} columns")
+        raise ValueError(
+            f"{path}, line {number}: {len(line)} cells where the header names {len(names)} columns"
+        )
     values = []
     for name, cell in zip(names, line, strict=True):
         try:
@@ -344,4 +354,6 @@ def make_reference(what: str | Reference) -> Reference:
             return from_csv(what)
     elif isinstance(what, Reference):
         return what
-    raise ValueError(f"reference must be one of {sorted(_BY_NAME)}, a path ending in .csv, or a Reference; got {what!r}")
+    raise ValueError(
+        f"reference must be one of {sorted(_BY_NAME)}, a path ending in .csv, or a Reference; got {what!r}"
+    )

@@ -54,7 +54,7 @@ def stage_cost_kernel(x, row, command, hover, Q, R):  # type: ignore[no-untyped-
 
 
 def tracking_error(x: ArrayLike, rows: ArrayLike) -> Array:
-    """x - x_ref of the reward, the error whose weighted square is the stage cost.
+    """X - x_ref of the reward, the error whose weighted square is the stage cost.
 
     Args:
         x: States, (..., >= 12).

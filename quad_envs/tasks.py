@@ -19,7 +19,12 @@ class Task:
     dt: float = 0.05  # s, control period
     episode_steps: int = 200  # control periods until truncation
     layout: TrackingLayout = field(default_factory=TrackingLayout)
-    sensor_noise: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # 1 sigma of position, velocity, attitude, rates
+    sensor_noise: tuple[float, float, float, float] = (
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+    )  # 1 sigma of position, velocity, attitude, rates
     reward: str = "bounded"  # or "quadratic"
 
     @property

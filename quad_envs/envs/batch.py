@@ -70,7 +70,11 @@ class TrackingBatch:
         self._steps = np.zeros(n, dtype=np.int64)
 
     def reset_row(
-        self, i: int, rng: np.random.Generator, out: NDArray[np.float32], options: Mapping[str, Any] | None = None
+        self,
+        i: int,
+        rng: np.random.Generator,
+        out: NDArray[np.float32],
+        options: Mapping[str, Any] | None = None,
     ) -> None:
         """Begin a new episode in row i and write its first observation.
 
@@ -101,7 +105,15 @@ class TrackingBatch:
             rng.standard_normal(out=self.noises[i])
             self.noises[i] *= self._noise
         observe_row(
-            self.rows, i, self.references, self.disturbances, self.noises, self._which, self._vector, self._scratch, out
+            self.rows,
+            i,
+            self.references,
+            self.disturbances,
+            self.noises,
+            self._which,
+            self._vector,
+            self._scratch,
+            out,
         )
 
     def step(self, actions: NDArray[np.floating], out: NDArray[np.float32]) -> None:
@@ -165,7 +177,9 @@ class TrackingBatch:
             raise ValueError(f"unknown reset option {unknown[0]!r}; known: 'state' (12 or 16 numbers)")
         state = np.asarray(options["state"], dtype=np.float64)
         if state.shape not in ((12,), (16,)) or not np.isfinite(state).all():
-            raise ValueError(f"reset option 'state' must be 12 or 16 finite numbers, got {options['state']!r}")
+            raise ValueError(
+                f"reset option 'state' must be 12 or 16 finite numbers, got {options['state']!r}"
+            )
         if max(abs(state[6]), abs(state[7])) >= CRASH_TILT:
             raise ValueError(
                 f"reset option 'state': roll and pitch must be below {math.degrees(CRASH_TILT):.0f} deg, "

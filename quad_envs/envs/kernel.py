@@ -11,7 +11,7 @@ import numpy as np
 from .._numba import inline_kernel, kernel
 from ..constraints import POSITION_SCALE, TILT_SCALE, TOLERANCE, VELOCITY_SCALE, force_from_action
 from ..dynamics import LANES, SCRATCH_ROWS, advance, load_vehicle, store_vehicle
-from ..observations import N_OWN, N_REFERENCE, encode_own, encode_preview
+from ..observations import N_OWN, encode_own, encode_preview
 from ..parameters import N_COEFFICIENTS, Array
 from ..reward import stage_cost_kernel
 from ..tasks import Task
@@ -230,4 +230,12 @@ def observe_row(rows, i, references, disturbances, noises, which, task, scratch,
     row = rows[i]
     reference = references[which[0, i]]
     _judge(row, reference[int(row[STEP])], row[COMMAND], True, task)
-    observe(row, reference, disturbances[which[1, i]], noises[which[2, i]], task, scratch[scratch.size - 16 :], out)
+    observe(
+        row,
+        reference,
+        disturbances[which[1, i]],
+        noises[which[2, i]],
+        task,
+        scratch[scratch.size - 16 :],
+        out,
+    )

@@ -167,7 +167,9 @@ class TrackingOptions:
         state = np.zeros(N_STATE)
         state[: len(self.start)] = self.start
         if abs(state[6]) >= CRASH_TILT or abs(state[7]) >= CRASH_TILT:
-            raise ValueError(f"start roll and pitch must be below {CRASH_TILT:.4f} rad, got {state[6:8].tolist()}")
+            raise ValueError(
+                f"start roll and pitch must be below {CRASH_TILT:.4f} rad, got {state[6:8].tolist()}"
+            )
         return state
 
     def start_half_widths(self) -> Array:
@@ -198,9 +200,13 @@ class TrackingOptions:
             if not (_is_number(value) and 0.0 <= value < 1.0):
                 raise ValueError(f"randomize[{name!r}] is a relative spread in [0, 1), got {value!r}")
             if name == "drag" and value > 0.0 and self.drag == 0.0:
-                raise ValueError("randomize['drag'] varies the drag in proportion: give the env a drag > 0 first")
+                raise ValueError(
+                    "randomize['drag'] varies the drag in proportion: give the env a drag > 0 first"
+                )
         if self.kappa * (1.0 - spread.get("kappa", 0.0)) <= 0.25:
-            raise ValueError(f"randomize={self.randomize!r} would draw rotors too weak to hover at kappa = {self.kappa}")
+            raise ValueError(
+                f"randomize={self.randomize!r} would draw rotors too weak to hover at kappa = {self.kappa}"
+            )
         return {name: float(value) for name, value in spread.items() if value > 0.0}
 
 

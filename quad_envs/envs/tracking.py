@@ -18,7 +18,9 @@ from .options import TrackingOptions
 
 Observation = NDArray[np.float32]
 
-_REWARD, _STAGE_COST, _COST, _EPISODE_COST, _VIOLATED, _CRASHED, _TRUNCATED, _CLIPPED = range(8)  # within SCORES
+_REWARD, _STAGE_COST, _COST, _EPISODE_COST, _VIOLATED, _CRASHED, _TRUNCATED, _CLIPPED = range(
+    8
+)  # within SCORES
 
 
 class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -130,7 +132,13 @@ class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         observation = np.empty(self._size, dtype=np.float32)
         self._batch.step(actions.reshape(1, 4), observation.reshape(1, -1))
         scores = self._scores.tolist()
-        return observation, scores[_REWARD], scores[_CRASHED] > 0.0, scores[_TRUNCATED] > 0.0, self._info(scores)
+        return (
+            observation,
+            scores[_REWARD],
+            scores[_CRASHED] > 0.0,
+            scores[_TRUNCATED] > 0.0,
+            self._info(scores),
+        )
 
     def _info(self, scores: list[float]) -> dict[str, Any]:
         return {

@@ -107,12 +107,18 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.floa
         observations = self._fresh_observations()
         for i in range(self.num_envs):
             if mask[i]:
-                one = dict(given) if state is None else {**given, "state": state if state.ndim == 1 else state[i]}
+                one = (
+                    dict(given)
+                    if state is None
+                    else {**given, "state": state if state.ndim == 1 else state[i]}
+                )
                 self._batch.reset_row(i, self._generators[i], observations[i], one)
             else:
                 observations[i] = self._last[i]
         self._done[mask] = False
-        self._last = observations if self.autoreset_mode is not AutoresetMode.DISABLED else observations.copy()
+        self._last = (
+            observations if self.autoreset_mode is not AutoresetMode.DISABLED else observations.copy()
+        )
         return observations, self._info()
 
     def step(self, actions: NDArray[np.float32]) -> _Step:
@@ -164,7 +170,9 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.floa
         if seed is None and self._generators:
             return
         if seed is None or isinstance(seed, int | np.integer):
-            seeds: Sequence[int | None] = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
+            seeds: Sequence[int | None] = [
+                None if seed is None else int(seed) + i for i in range(self.num_envs)
+            ]
         else:
             seeds = seed
         if len(seeds) != self.num_envs:

@@ -1,0 +1,120 @@
+"""Reference trajectories: their velocities are the derivatives of their positions, and bad tables are refused."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from quad_envs.references import (
+    Heading,
+    Helix,
+    Lemniscate,
+    OutAndBack,
+    RandomSmooth,
+    SetPoint,
+    SphericalSpiral,
+    from_csv,
+    from_function,
+    make_reference,
+)
+
+ALL = [SetPoint((1.0, 2.0, 3.0)), Helix(), SphericalSpiral(), OutAndBack(), Lemniscate(), RandomSmooth()]
+
+
+def circle(t):
+    return [2 * np.cos(t), 2 * np.sin(t), -0.1 * t]
+
+
+def rows_of(reference, t, seed=0):
+    return reference.rows(np.asarray(t, dtype=float), np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("reference", [*ALL, from_function(circle)], ids=lambda r: type(r).__name__)
+def test_velocity_is_the_derivative_of_position(reference):
+    t, h = np.array([0.3, 2.1, 4.4, 7.3]), 1e-5
+    slope = (rows_of(reference, t + h)[:, :3] - rows_of(reference, t - h)[:, :3]) / (2 * h)
+    np.testing.assert_allclose(rows_of(reference, t)[:, 3:6], slope, atol=1e-5)
+
+
+@pytest.mark.parametrize("reference", ALL, ids=lambda r: type(r).__name__)
+def test_heading_is_stored_as_sine_and_cosine(reference):
+    rows = rows_of(reference, np.linspace(0, 10, 50))
+    np.testing.assert_allclose(rows[:, 6] ** 2 + rows[:, 7] ** 2, 1.0)
+
+
+def test_lines_turn_at_the_sample_of_the_turn_time():
+    rows = rows_of(OutAndBack(), 0.05 * np.arange(200))
+    assert (rows[99, 3:6] > 0).all() and (rows[100, 3:6] < 0).all()
+    np.testing.assert_allclose(rows[100, :3], [6.25, 6.25, 5.0])
+
+
+def test_random_reference_starts_at_the_origin_differs_by_seed_and_repeats_by_seed():
+    t = np.linspace(0, 10, 40)
+    first, again, other = (
+        rows_of(RandomSmooth(), t, 1),
+        rows_of(RandomSmooth(), t, 1),
+        rows_of(RandomSmooth(), t, 2),
+    )
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
+    np.testing.assert_allclose(first[0, :3], 0.0, atol=1e-12)
+
+
+def test_tangent_heading_points_along_the_path():
+    rows = rows_of(Heading(from_function(circle), tangent=True), [0.5, 2.0])
+    np.testing.assert_allclose(rows[:, 6], rows[:, 4] / np.hypot(rows[:, 3], rows[:, 4]), atol=1e-9)
+
+
+def test_function_with_velocity_and_heading_is_taken_as_it_is():
+    rows = rows_of(from_function(lambda t: [t, 0, 0, 1, 0, 0, 0.5]), [0.0, 1.0])
+    np.testing.assert_allclose(rows[:, 3:6], [[1, 0, 0], [1, 0, 0]])
+    np.testing.assert_allclose(rows[:, 6], np.sin(0.5))
+
+
+@pytest.mark.parametrize("bad", [lambda t: [1, 2], lambda t: [np.nan, 0, 0], lambda t: 3.0])
+def test_function_with_a_bad_result_is_refused(bad):
+    with pytest.raises(ValueError, match="reference function"):
+        rows_of(from_function(bad), [0.0, 1.0])
+
+
+def write(tmp_path, text):
+    path = tmp_path / "a path with spaces.csv"
+    path.write_text(text)
+    return path
+
+
+def test_csv_is_reproduced_at_its_lines_and_rests_after_its_end(tmp_path):
+    t = np.linspace(0, 2, 21)
+    lines = "\n".join(f"{a:.3f},{np.sin(a):.9f},{np.cos(a):.9f},0" for a in t)
+    reference = from_csv(write(tmp_path, "t,x,y,z\n" + lines + "\n"))
+    np.testing.assert_allclose(rows_of(reference, t)[:, 0], np.sin(t), atol=1e-8)
+    between = rows_of(reference, t[:-1] + 0.05)
+    np.testing.assert_allclose(between[:, 0], np.sin(t[:-1] + 0.05), atol=2e-3)
+    after = rows_of(reference, [2.5, 9.0])
+    np.testing.assert_allclose(after[:, 3:6], 0.0)
+    np.testing.assert_allclose(after[:, 0], np.sin(2.0), atol=1e-8)
+    assert pickle.loads(pickle.dumps(reference)).rows(t, None).shape == (21, 8)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t,x,y\n0,0,0\n1,0,0\n", "missing \\['z'\\]"),
+        ("t,x,y,z,w\n0,0,0,0,0\n1,0,0,0,0\n", "unknown \\['w'\\]"),
+        ("t,x,y,z\n0,0,0,0\n0.1,nan,0,0\n", "line 3: x must be a finite number, got 'nan'"),
+        ("t,x,y,z\n0,0,0,0\n0.1,,0,0\n", "line 3: x must be a finite number, got ''"),
+        ("t,x,y,z\n0,0,0,0\n0.1,0,0\n", "line 3: 3 cells"),
+        ("t,x,y,z\n0,0,0,0\n0,0,0,0\n", "line 3: time must increase"),
+        ("t,x,y,z\n0,0,0,0\n5,0,0,0\n", "line 3: a gap of 5 s"),
+        ("t,x,y,z\n0,0,0,0\n", "at least two lines"),
+        ("t,x,y,z,vx\n0,0,0,0,0\n1,0,0,0,0\n", "all of vx, vy, vz"),
+        ("", "header"),
+    ],
+)
+def test_a_broken_csv_is_refused_with_its_line(tmp_path, text, message):
+    with pytest.raises(ValueError, match=message):
+        from_csv(write(tmp_path, text))
+
+
+def test_unknown_reference_name_lists_the_known_ones():
+    with pytest.raises(ValueError, match="helix"):
+        make_reference("hleix")
