@@ -1,4 +1,4 @@
-"""Quadrotor environments for Gymnasium and PettingZoo. Importing this package registers the ids and does nothing else."""
+"""Quadrotor environments for Gymnasium and PettingZoo; importing the package registers their ids."""
 
 from __future__ import annotations
 

@@ -1,14 +1,16 @@
-"""Compilation of kernels: one decorator with the project's options, and one line on the terminal when it takes time."""
+"""Compilation of kernels: decorators with the project's options, and one line when it takes time."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 from numba.core import event
 
+Int = int | np.int64  # an argument that a kernel may be given as a constant, see quad_envs.dynamics
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _PACKAGES = ("quad_envs", "controllers", "baselines", "benchmarks")
@@ -16,17 +18,15 @@ _PACKAGES = ("quad_envs", "controllers", "baselines", "benchmarks")
 
 def kernel(function: Function) -> Function:
     """Compile on first call, cached on disk; division follows IEEE 754. Call it with every argument given."""
-    compiled: Function = numba.njit(cache=True, error_model="numpy")(function)
-    return compiled
+    return cast(Function, numba.njit(cache=True, error_model="numpy")(function))
 
 
 def inline_kernel(function: Function) -> Function:
     """As `kernel`, but LLVM always inlines it into its caller, so that loops around it vectorise."""
-    compiled: Function = numba.njit(cache=True, error_model="numpy", forceinline=True)(function)
-    return compiled
+    return cast(Function, numba.njit(cache=True, error_model="numpy", forceinline=True)(function))
 
 
-class _Announcer(event.Listener):  # type: ignore[misc]
+class _Announcer(event.Listener):
     """Says once per process that kernels are being compiled, since the first call then takes seconds."""
 
     def __init__(self) -> None:

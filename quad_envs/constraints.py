@@ -1,4 +1,4 @@
-"""Limits as constraint rows: their names, values and violation; and the map between actions and rotor forces."""
+"""Limits as constraint rows (names, values, scales); the map between actions and rotor forces."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def constraint_names(limits: Limits) -> tuple[str, ...]:
 def constraint_values(
     plant: ArrayLike, command: ArrayLike, previous: ArrayLike, limits: Limits, dt: float
 ) -> Array:
-    """Value minus limit of each row, in SI units; positive means violated. Readable twin of the environments' kernel.
+    """Value minus limit of each row, SI; positive means violated. Readable twin of the environments' kernel.
 
     Args:
         plant: [p, V_B, Theta, Omega, ...], (..., >= 12).
@@ -71,13 +71,13 @@ def constraint_scales(limits: Limits, dt: float) -> Array:
 
 
 @inline_kernel
-def force_from_action(action, hover, force_max):  # type: ignore[no-untyped-def]
-    """Rotor command of one action entry in [-1, 1]: -1 -> 0, 0 -> hover, +1 -> force_max, piecewise linear."""
+def force_from_action(action: float, hover: float, force_max: float) -> float:
+    """Rotor command of one action entry: -1 -> 0, 0 -> hover, +1 -> force_max, piecewise linear."""
     return hover + action * (hover if action < 0.0 else force_max - hover)
 
 
 @kernel
-def _actions_from_forces(forces, hover, force_max, out):  # type: ignore[no-untyped-def]
+def _actions_from_forces(forces: Array, hover: float, force_max: float, out: NDArray[np.float32]) -> None:
     for i in range(forces.size):
         change = forces[i] - hover
         out[i] = min(max(change / (hover if change < 0.0 else force_max - hover), -1.0), 1.0)

@@ -1,7 +1,7 @@
-"""Disturbances, as data: rows [torque 3 (body axes, N m), force 3 (inertial axes, N)] at the integrator's stage times.
+"""Disturbances, as data: [torque 3 (body axes, N m), force 3 (inertial axes, N)] at the stage times of RK4.
 
-A disturbance gives its value at nodes t of shape (n_steps, 2 substeps + 1): row k holds the stage times of control
-step k, so that a step may begin or end a pulse without smearing it over its neighbour.
+A disturbance gives its value at nodes t of shape (n_steps, 2 substeps + 1): row k holds the stage times of
+control step k, so that a step may begin or end a pulse without smearing it over its neighbour.
 """
 
 from __future__ import annotations
@@ -37,8 +37,9 @@ class Disturbance(Protocol):
 class TorquePulse:
     """e^{-0.1 a} [sin 10a, cos 10a, 0] N m while start < t < stop, section 4.6.
 
-    The text does not say from when `a` counts. `clock="absolute"` (a = t) is the reading that a vehicle with the
-    printed rotors survives; `"relative"` (a = t - start) starts with 1 N m, beyond its roll authority of 0.65 N m.
+    The text does not say from when `a` counts. `clock="absolute"` (a = t) is the reading that a vehicle with
+    the printed rotors survives; `"relative"` (a = t - start) starts with 1 N m, beyond its roll authority of
+    0.65 N m.
 
     Raises:
         ValueError: If the clock is unknown or start >= stop.
@@ -59,7 +60,7 @@ class TorquePulse:
             raise ValueError(f"a pulse needs start < stop, got {self.start!r} and {self.stop!r} s")
 
     def values(self, t: Array, rng: np.random.Generator) -> Array:
-        """Torque and force at the nodes, (n_steps, n_nodes, 6); a control step is inside or outside as a whole."""
+        """Torque and force at the nodes, (n_steps, n_nodes, 6); a step is inside or outside as a whole."""
         a = t - self.start if self.clock == "relative" else t
         middle = t[:, t.shape[1] // 2]
         inside = ((middle > self.start) & (middle < self.stop))[:, None]
@@ -105,7 +106,7 @@ class Gusts:
             raise ValueError(f"correlation_time must be > 0 s, got {self.correlation_time!r}")
 
     def values(self, t: Array, rng: np.random.Generator) -> Array:
-        """Torque and force at the nodes, (n_steps, n_nodes, 6); the last node of a step is the first of the next."""
+        """Torque and force at the nodes, (n_steps, n_nodes, 6), continuous from step to step."""
         steps, nodes = t.shape
         times = np.append(t[:, :-1].ravel(), t[-1, -1])
         keep = math.exp(-float(times[1] - times[0]) / self.correlation_time)

@@ -1,19 +1,22 @@
 """Equations of motion of one quadrotor, Eqs. (2.32) to (2.38) corrected, and their integrator.
 
-`rigid_body` is the one compiled statement of the derivative. The single environment, the vector environment and the
-exact NMPC all call it; `derivative_reference` is its readable twin on numpy arrays.
+`rigid_body` is the one compiled statement of the derivative. The single environment, the vector environment
+and the exact NMPC all call it; `derivative_reference` is its readable twin on numpy arrays.
 
-The integrator is RK4 on the 12 rigid-body states with the rotor lag in closed form (RK4 on all 16 states is unstable
-for one substep of 0.05 s, since lambda_F h > 1). It works on columns ("lanes") of a flat scratch array, so that the
-same code runs one vehicle (stride 1) or a block of vehicles whose loop LLVM vectorises (stride LANES).
+The integrator is RK4 on the 12 rigid-body states with the rotor lag in closed form (RK4 on all 16 states is
+unstable for one substep of 0.05 s, since lambda_F h > 1). It works on columns ("lanes") of a flat scratch
+array, so that the same code runs one vehicle (stride 1) or a block of vehicles whose loop LLVM vectorises
+(stride LANES).
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import ArrayLike
+from collections.abc import Sequence
 
-from ._numba import inline_kernel, kernel
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ._numba import Int, inline_kernel, kernel
 from .parameters import (
     ATTITUDE,
     DRAG_RATE,
@@ -56,7 +59,9 @@ SCRATCH_ROWS = 66
 
 
 @inline_kernel
-def rigid_body(x, F, d, c):  # type: ignore[no-untyped-def]
+def rigid_body(
+    x: Sequence[float], F: Sequence[float], d: Sequence[float], c: Sequence[float]
+) -> tuple[float, ...]:
     """Derivative of the 12 states, Eq. (2.32) with T = sum F > 0 along -z_B.
 
     Args:
@@ -136,35 +141,35 @@ def derivative_reference(
     return out
 
 
-# In these helpers `o` is the place of an entry in the scratch array. Places and strides are passed as int64 expressions,
-# never as literals: numba would compile the helper anew for each literal.
+# In these helpers `o` is the place of an entry in the scratch array. Places and strides are passed as int64
+# expressions, never as literals: numba would compile the helper anew for each literal.
 @inline_kernel
-def _four(w, o, stride):  # type: ignore[no-untyped-def]
+def _four(w: Array, o: Int, stride: Int) -> tuple[float, float, float, float]:
     """Four entries of one lane."""
     return w[o], w[o + stride], w[o + 2 * stride], w[o + 3 * stride]
 
 
 @inline_kernel
-def _twelve(w, o, stride):  # type: ignore[no-untyped-def]
+def _twelve(w: Array, o: Int, stride: Int) -> tuple[float, ...]:
     """Twelve entries of one lane."""
     return _four(w, o, stride) + _four(w, o + 4 * stride, stride) + _four(w, o + 8 * stride, stride)
 
 
 @inline_kernel
-def _lagged(force, command, decay):  # type: ignore[no-untyped-def]
+def _lagged(force: float, command: float, decay: float) -> float:
     """Rotor force after the decay, Eq. (2.38) in closed form."""
     return command + (force - command) * decay
 
 
 @inline_kernel
-def _accumulate(w, o, stride, slope, weight, ahead):  # type: ignore[no-untyped-def]
-    """Take one component's stage derivative into the weighted sum and move the component to the next stage."""
+def _accumulate(w: Array, o: Int, stride: Int, slope: float, weight: float, ahead: float) -> None:
+    """Take one component's stage derivative into the weighted sum; move the component to the next stage."""
     w[o + _ACC * stride] += weight * slope
     w[o + _Y * stride] = w[o + _X * stride] + ahead * slope
 
 
 @inline_kernel
-def _lane_stage(w, j, stride, weight, ahead):  # type: ignore[no-untyped-def]
+def _lane_stage(w: Array, j: Int, stride: Int, weight: float, ahead: float) -> None:
     """One stage of RK4 for lane j."""
     decay = w[_DECAY * stride + j]
     F = _four(w, _F * stride + j, stride)
@@ -192,7 +197,7 @@ def _lane_stage(w, j, stride, weight, ahead):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _stage(w, stride, decay_row, weight, ahead):  # type: ignore[no-untyped-def]
+def _stage(w: Array, stride: Int, decay_row: int, weight: float, ahead: float) -> None:
     """One stage of RK4 for all lanes; rotor forces decay by scratch row `decay_row`.
 
     Strides, rows and trip counts in the loop are constants: only so can LLVM prove the lanes independent.
@@ -207,7 +212,7 @@ def _stage(w, stride, decay_row, weight, ahead):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _finish_substep(w, stride, sixth):  # type: ignore[no-untyped-def]
+def _finish_substep(w: Array, stride: Int, sixth: float) -> None:
     """X <- x + h/6 (k1 + 2 k2 + 2 k3 + k4); the rotor forces move on by a whole substep."""
     for i in range(N_STATE):
         for o in range(i * stride, (i + 1) * stride):
@@ -217,14 +222,22 @@ def _finish_substep(w, stride, sixth):  # type: ignore[no-untyped-def]
             w[o + _ACC * stride] = 0.0
     for i in range(N_INPUT):
         for j in range(stride):
-            o = i * stride + j
-            w[o + _F * stride] = _lagged(
-                w[o + _F * stride], w[o + _CMD * stride], w[_DECAY_WHOLE * stride + j]
+            k = i * stride + j
+            w[k + _F * stride] = _lagged(
+                w[k + _F * stride], w[k + _CMD * stride], w[_DECAY_WHOLE * stride + j]
             )
 
 
 @kernel
-def _load_disturbance(w, stride, lanes, disturbances, which, step, node):  # type: ignore[no-untyped-def]
+def _load_disturbance(
+    w: Array,
+    stride: Int,
+    lanes: int,
+    disturbances: Array,
+    which: NDArray[np.int64],
+    step: NDArray[np.int64],
+    node: int,
+) -> None:
     """Read the disturbance of each lane at one stage time."""
     for j in range(lanes):
         row = min(step[j], disturbances.shape[1] - 1)
@@ -233,7 +246,16 @@ def _load_disturbance(w, stride, lanes, disturbances, which, step, node):  # typ
 
 
 @inline_kernel
-def load_vehicle(w, j, stride, plant, command, force_max, coefficients, h):  # type: ignore[no-untyped-def]
+def load_vehicle(
+    w: Array,
+    j: Int,
+    stride: Int,
+    plant: Array,
+    command: Array,
+    force_max: float,
+    coefficients: Array,
+    h: float,
+) -> None:
     """Put one vehicle into lane j.
 
     Args:
@@ -264,8 +286,8 @@ def load_vehicle(w, j, stride, plant, command, force_max, coefficients, h):  # t
 
 
 @inline_kernel
-def store_vehicle(w, j, stride, plant):  # type: ignore[no-untyped-def]
-    """Copy lane j back to a plant row; a non-finite result leaves the row as it was. Returns whether it was finite."""
+def store_vehicle(w: Array, j: Int, stride: Int, plant: Array) -> bool:
+    """Copy lane j to a plant row if it is finite, else leave the row as it was; returns whether it is."""
     total = 0.0
     for i in range(N_STATE + N_INPUT):
         total += abs(w[(_X + i) * stride + j])
@@ -277,7 +299,16 @@ def store_vehicle(w, j, stride, plant):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def advance(w, stride, lanes, substeps, h, disturbances, which, step):  # type: ignore[no-untyped-def]
+def advance(
+    w: Array,
+    stride: Int,
+    lanes: int,
+    substeps: int,
+    h: float,
+    disturbances: Array,
+    which: NDArray[np.int64],
+    step: NDArray[np.int64],
+) -> None:
     """Integrate the loaded lanes over one control period.
 
     Args:
@@ -306,7 +337,18 @@ def advance(w, stride, lanes, substeps, h, disturbances, which, step):  # type: 
 
 
 @kernel
-def _simulate(plants, commands, force_max, coefficients, substeps, h, w, which, step, disturbances):  # type: ignore[no-untyped-def]
+def _simulate(
+    plants: Array,
+    commands: Array,
+    force_max: float,
+    coefficients: Array,
+    substeps: int,
+    h: float,
+    w: Array,
+    which: NDArray[np.int64],
+    step: NDArray[np.int64],
+    disturbances: Array,
+) -> None:
     for j in range(plants.shape[0]):
         load_vehicle(w, 0, 1, plants[j], commands[j], force_max, coefficients, h)
         advance(w, 1, 1, substeps, h, disturbances, which, step)

@@ -121,7 +121,7 @@ class TrackingLayout:
 
 
 @inline_kernel
-def encode_own(out, plant, command):  # type: ignore[no-untyped-def]
+def encode_own(out: NDArray[np.float32], plant: Array, command: Array) -> None:
     """Write the `own` block.
 
     Args:
@@ -143,7 +143,9 @@ def encode_own(out, plant, command):  # type: ignore[no-untyped-def]
 
 
 @inline_kernel
-def encode_preview(out, start, reference, row, stages, p):  # type: ignore[no-untyped-def]
+def encode_preview(
+    out: NDArray[np.float32], start: int, reference: Array, row: int, stages: int, p: Array
+) -> None:
     """Write reference rows row..row+stages-1 from out[start] on, positions relative to p."""
     rows = reference[row : row + stages].reshape(-1)
     target = out[start : start + N_REFERENCE * stages]

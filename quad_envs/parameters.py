@@ -1,4 +1,4 @@
-"""What a person chooses about a vehicle: physical parameters, limits and weights. SI units, validated, frozen."""
+"""What a person chooses about a vehicle: parameters, limits and weights. SI units, validated, frozen."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class QuadrotorParams:
         return B
 
     def coefficients(self) -> Array:
-        """The combinations of parameters that the equations of motion use, in kernel order, (N_COEFFICIENTS,)."""
+        """What the equations of motion use of the parameters, in kernel order, (N_COEFFICIENTS,)."""
         Jx, Jy, Jz = self.inertia
         return np.array(
             [
@@ -125,8 +125,8 @@ class QuadrotorParams:
 class Limits:
     """What a flight may not exceed. Infinity means no limit.
 
-    The rotor box is physical: the plant saturates. The others are constraints, Eqs. (3.10) and (3.11): exceeding
-    them is counted, costs reward, and is what an MPC plans around.
+    The rotor box is physical: the plant saturates. The others are constraints, Eqs. (3.10) and (3.11):
+    exceeding them is counted, costs reward, and is what an MPC plans around.
 
     Raises:
         ValueError: If kappa leaves no hover, a limit is not positive, or the position box is empty.

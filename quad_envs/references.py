@@ -1,8 +1,8 @@
-"""Reference trajectories, as data: each gives rows [p_ref 3, v_ref 3, sin psi_ref, cos psi_ref] at given times.
+"""Reference trajectories, as data: rows [p_ref 3, v_ref 3, sin psi_ref, cos psi_ref] at given times.
 
 Positions are NED (z down), velocities inertial, SI. The defaults of helix, spiral and lines are the sets that
-reproduce tables 4.1 and 4.2; the dissertation shows its trajectories only as figures. A trajectory of your own is
-`from_function(f)`, `from_csv(path)`, or any object with `random` and `rows(t, rng)`.
+reproduce tables 4.1 and 4.2; the dissertation shows its trajectories only as figures. A trajectory of your
+own is `from_function(f)`, `from_csv(path)`, or any object with `random` and `rows(t, rng)`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Reference(Protocol):
 
 
 def pack_rows(p: ArrayLike, v: ArrayLike, psi: ArrayLike = 0.0) -> Array:
-    """Stack positions (n, 3), inertial velocities (n, 3) and headings (n,) or scalar, rad, into rows (n, 8)."""
+    """Rows (n, 8) of positions (n, 3), inertial velocities (n, 3) and headings (n,) or scalar, rad."""
     p, v = np.asarray(p, dtype=np.float64), np.asarray(v, dtype=np.float64)
     out = np.empty((p.shape[0], N_REFERENCE))
     out[:, :3], out[:, 3:6] = p, v
@@ -217,8 +217,9 @@ def from_function(function: Callable[[float], ArrayLike]) -> Reference:
     """Any trajectory given as a function of time.
 
     Args:
-        function: t in s -> 3 (p), 4 (p, psi), 6 (p, v) or 7 (p, v, psi) numbers, SI, NED. It is sampled when an
-            environment is made, at the control period; without v it is also called a millisecond before and after.
+        function: t in s -> 3 (p), 4 (p, psi), 6 (p, v) or 7 (p, v, psi) numbers, SI, NED. It is sampled when
+            an environment is made, at the control period; without v it is also called a millisecond before
+            and after.
 
     Returns:
         A reference for `gym.make(..., reference=...)`. It pickles if the function does.
@@ -262,9 +263,9 @@ def from_csv(path: str | Path, *, max_gap: float = 1.0) -> Reference:
     """A trajectory from a table with a header line.
 
     Args:
-        path: Columns t, x, y, z (s, m, NED), optionally vx, vy, vz (m/s, inertial) and psi (rad), in any order.
-            Without velocities they are central differences. Before the first and after the last line the
-            reference rests there.
+        path: Columns t, x, y, z (s, m, NED), optionally vx, vy, vz (m/s, inertial) and psi (rad), in any
+            order. Without velocities they are central differences. Before the first and after the last line
+            the reference rests there.
         max_gap: Longest time between two lines, s; a longer one is taken for lost data.
 
     Returns:
@@ -272,8 +273,8 @@ def from_csv(path: str | Path, *, max_gap: float = 1.0) -> Reference:
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If a column is missing or unknown, a cell is empty, not a number or not finite, time does not
-            increase, or lines are missing; the message names the line.
+        ValueError: If a column is missing or unknown, a cell is empty, not a number or not finite, time does
+            not increase, or lines are missing; the message names the line.
     """
     with Path(path).open(newline="", encoding="utf-8-sig") as file:
         lines = list(csv.reader(file))
@@ -282,7 +283,8 @@ def from_csv(path: str | Path, *, max_gap: float = 1.0) -> Reference:
     unknown = [name for name in names if name not in _CSV_COLUMNS]
     if missing or unknown:
         raise ValueError(
-            f"{path}: the header must name {', '.join(_CSV_COLUMNS[:4])} (and may name {', '.join(_CSV_COLUMNS[4:])}); "
+            f"{path}: the header must name {', '.join(_CSV_COLUMNS[:4])} "
+            f"(and may name {', '.join(_CSV_COLUMNS[4:])}); "
             f"missing {missing}, unknown {unknown}"
         )
     table = np.array(

@@ -1,10 +1,10 @@
-"""THE reward: one bounded formula for every task and every policy, monotone step by step in the MPCs' stage cost.
+"""THE reward: one bounded formula for every task and policy, monotone step by step in the MPCs' stage cost.
 
     reward = (1 - v) / (1 + l),   l = |x - x_ref|_Q^2 + |u - u_T|_R^2,   v = min(1, sum_j hinge_j / scale_j)
 
-It is positive while the vehicle flies within its limits and a crash ends the episode, so that crashing early is never
-better than flying badly. x_ref = [p_ref; R_BI v_ref; 0, 0, psi_ref; 0]: the velocity error is the inertial one, seen
-in body axes; the yaw error is wrapped.
+It is positive while the vehicle flies within its limits and a crash ends the episode, so that crashing early
+is never better than flying badly. x_ref = [p_ref; R_BI v_ref; 0, 0, psi_ref; 0]: the velocity error is the
+inertial one, seen in body axes; the yaw error is wrapped.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from .rotations import rotation_body_from_inertial, sincos, wrap_angle, wrap_ang
 
 
 @inline_kernel
-def stage_cost_kernel(x, row, command, hover, Q, R):  # type: ignore[no-untyped-def]
+def stage_cost_kernel(x: Array, row: Array, command: Array, hover: float, Q: Array, R: Array) -> float:
     """The stage cost l of one vehicle.
 
     Args:
@@ -50,7 +50,7 @@ def stage_cost_kernel(x, row, command, hover, Q, R):  # type: ignore[no-untyped-
     for i in range(4):
         du = command[i] - hover
         cost += R[i] * du * du
-    return cost
+    return float(cost)
 
 
 def tracking_error(x: ArrayLike, rows: ArrayLike) -> Array:

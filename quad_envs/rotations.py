@@ -1,4 +1,4 @@
-"""Rotations of the 3-2-1 sequence, Eq. (2.33): R_BI, the Euler rate matrix W, sine and cosine kernels, angle wrap."""
+"""Rotations of the 3-2-1 sequence, Eq. (2.33): R_BI, the Euler rate matrix W, sine and cosine, angle wrap."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _PIO2_3 = 5.39030285815811905290e-15
 
 @inline_kernel
 def sincos(angle: float) -> tuple[float, float]:
-    """Sine and cosine without branches or calls, so that a loop around it vectorises; error below 2e-16 for |angle| < 1e5."""
+    """Sine and cosine without branches or calls, so that a loop around it vectorises (|angle| < 1e5)."""
     turns = np.floor(angle * _TWO_OVER_PI + 0.5)
     a = ((angle - turns * _PIO2_1) - turns * _PIO2_2) - turns * _PIO2_3
     z = a * a
@@ -39,7 +39,7 @@ def sincos(angle: float) -> tuple[float, float]:
 @inline_kernel
 def wrap_angle_scalar(angle: float) -> float:
     """The angle modulo 2 pi in [-pi, pi), compiled twin of `wrap_angle`."""
-    return angle - 2.0 * np.pi * np.floor(angle / (2.0 * np.pi) + 0.5)
+    return angle - 2.0 * np.pi * float(np.floor(angle / (2.0 * np.pi) + 0.5))
 
 
 def wrap_angle(angle: ArrayLike) -> Array:

@@ -1,16 +1,17 @@
-"""Task: the frozen value from which a policy is built. It says what an engineer would know of the flight, no more."""
+"""Task: the frozen value from which a policy is built, what an engineer would know before the flight."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from .constraints import constraint_names
 from .observations import TrackingLayout
 from .parameters import Limits, QuadrotorParams, Weights
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What is known before the flight; states, references and disturbances reach a policy through observations only."""
+    """What is known before the flight; all else reaches a policy through observations only."""
 
     env_id: str = "quad/HelixTracking-v0"
     params: QuadrotorParams = field(default_factory=QuadrotorParams)  # nominal vehicle
@@ -26,6 +27,11 @@ class Task:
         0.0,
     )  # 1 sigma of position, velocity, attitude, rates
     reward: str = "bounded"  # or "quadratic"
+
+    @property
+    def constraint_names(self) -> tuple[str, ...]:
+        """Names of the entries of `info["constraint_values"]`."""
+        return constraint_names(self.limits)
 
     @property
     def hover_force(self) -> float:

@@ -1,4 +1,4 @@
-"""Reference trajectories: their velocities are the derivatives of their positions, and bad tables are refused."""
+"""Reference trajectories: velocities are derivatives of positions, and bad tables are refused."""
 
 import pickle
 

@@ -43,8 +43,8 @@ class TrackingBatch:
         self._randomization = options.randomization()
         self._start, self._widths = options.start_state(), options.start_half_widths()
         steps, dt, nodes = self.task.episode_steps, self.task.dt, 2 * options.substeps + 1
-        self._times = dt * np.arange(steps + 1 + self.task.layout.preview)
-        self._nodes = dt * (np.arange(steps)[:, None] + np.linspace(0.0, 1.0, nodes))
+        self._times: Array = dt * np.arange(steps + 1 + self.task.layout.preview, dtype=np.float64)
+        self._nodes: Array = dt * (np.arange(steps, dtype=np.float64)[:, None] + np.linspace(0.0, 1.0, nodes))
         self._noise = np.repeat(np.asarray(self.task.sensor_noise), 3)
         # A table that is the same in every episode is stored once.
         never = np.random.default_rng(0)

@@ -1,12 +1,14 @@
-"""The compiled step of the tracking task: actions in, observations and the reward out, for any number of vehicles.
+"""The compiled step of the tracking task: actions in, observations and rewards out, for any number of rows.
 
-Each vehicle is one row of a float64 array. The single environment is a batch of one row, so that both environments
-are the same computation by construction; blocks of LANES rows only let the integrator's loops vectorise.
+Each vehicle is one row of a float64 array. The single environment is a batch of one row, so that both
+environments are the same computation by construction; blocks of LANES rows only let the integrator's loops
+vectorise.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .._numba import inline_kernel, kernel
 from ..constraints import POSITION_SCALE, TILT_SCALE, TOLERANCE, VELOCITY_SCALE, force_from_action
@@ -69,14 +71,14 @@ def task_vector(task: Task, substeps: int, lost_distance: float) -> Array:
 
 
 @inline_kernel
-def _hinge(row, index, value, scale):  # type: ignore[no-untyped-def]
+def _hinge(row: Array, index: int, value: float, scale: float) -> float:
     """Record one constraint value; its share of the cost where it is violated."""
     row[VALUES + index] = value
     return value / scale if value > TOLERANCE else 0.0
 
 
 @kernel
-def _violation_cost(row, previous, task):  # type: ignore[no-untyped-def]
+def _violation_cost(row: Array, previous: Array, task: Array) -> float:
     """Sum of hinge / scale over the limits, `constraints.constraint_values` in compiled form."""
     index, cost = 0, 0.0
     if task[_TILT] < np.inf:
@@ -101,8 +103,8 @@ def _violation_cost(row, previous, task):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _judge(row, reference, previous, finite, task):  # type: ignore[no-untyped-def]
-    """Stage cost, violation, crash and reward of a row after its step; `reference` is the row at the new time."""
+def _judge(row: Array, reference: Array, previous: Array, finite: bool, task: Array) -> None:
+    """Stage cost, violation, crash and reward of a row after its step; `reference` is of the new time."""
     off = 0.0
     for i in range(3):
         off += (row[i] - reference[i]) ** 2
@@ -128,7 +130,15 @@ def _judge(row, reference, previous, finite, task):  # type: ignore[no-untyped-d
 
 
 @kernel
-def observe(row, reference, disturbance, noise, task, measured, out):  # type: ignore[no-untyped-def]
+def observe(
+    row: Array,
+    reference: Array,
+    disturbance: Array,
+    noise: Array,
+    task: Array,
+    measured: Array,
+    out: NDArray[np.float32],
+) -> None:
     """Write the observation of a row.
 
     Args:
@@ -163,10 +173,10 @@ def observe(row, reference, disturbance, noise, task, measured, out):  # type: i
 
 
 @inline_kernel
-def _command(row, actions, task):  # type: ignore[no-untyped-def]
+def _command(row: Array, actions: NDArray[np.floating], task: Array) -> None:
     """Take an action over into the row; entries outside [-1, 1] are clipped and counted."""
     for i in range(4):
-        action = np.float64(actions[i])
+        action = float(actions[i])
         if action < -1.0 or action > 1.0:
             row[CLIPPED] += 1.0
             action = min(max(action, -1.0), 1.0)
@@ -174,7 +184,18 @@ def _command(row, actions, task):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def step_rows(rows, references, disturbances, noises, which, actions, task, scratch, steps, out):  # type: ignore[no-untyped-def]
+def step_rows(
+    rows: Array,
+    references: Array,
+    disturbances: Array,
+    noises: Array,
+    which: NDArray[np.int64],
+    actions: NDArray[np.floating],
+    task: Array,
+    scratch: Array,
+    steps: NDArray[np.int64],
+    out: NDArray[np.float32],
+) -> int:
     """One control period of every row.
 
     Args:
@@ -225,7 +246,17 @@ def step_rows(rows, references, disturbances, noises, which, actions, task, scra
 
 
 @kernel
-def observe_row(rows, i, references, disturbances, noises, which, task, scratch, out):  # type: ignore[no-untyped-def]
+def observe_row(
+    rows: Array,
+    i: int,
+    references: Array,
+    disturbances: Array,
+    noises: Array,
+    which: NDArray[np.int64],
+    task: Array,
+    scratch: Array,
+    out: NDArray[np.float32],
+) -> None:
     """Observation of row i as it stands, after a reset; also its stage cost, with no command change yet."""
     row = rows[i]
     reference = references[which[0, i]]

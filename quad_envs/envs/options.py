@@ -182,7 +182,7 @@ class TrackingOptions:
         return out
 
     def noise_deviations(self) -> tuple[float, float, float, float]:
-        """Standard deviations of measured position, velocity, attitude and rates; one number scales (1, 1, 1, 1)."""
+        """Standard deviations of measured position, velocity, attitude and rates; one number is for all."""
         values = _spread("sensor_noise", self.sensor_noise, 4)
         if not all(value >= 0.0 for value in values):
             raise ValueError(f"sensor_noise must be >= 0, got {self.sensor_noise!r}")

@@ -9,7 +9,6 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ..constraints import constraint_names
 from ..parameters import Array
 from ..tasks import Task
 from .batch import TrackingBatch
@@ -18,57 +17,62 @@ from .options import TrackingOptions
 
 Observation = NDArray[np.float32]
 
-_REWARD, _STAGE_COST, _COST, _EPISODE_COST, _VIOLATED, _CRASHED, _TRUNCATED, _CLIPPED = range(
-    8
-)  # within SCORES
+# Entries of SCORES.
+_REWARD, _STAGE_COST, _COST, _EPISODE_COST, _VIOLATED, _CRASHED, _TRUNCATED, _CLIPPED = range(8)
 
 
 class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """A quadrotor follows a reference trajectory within limits.
 
     ## Description
-    The plant is the 12-state rigid body of Ru (2017) with first-order rotors, z down, integrated by RK4 with the rotor
-    lag in closed form. The registered ids differ in their default reference, start and limits only.
+    The plant is the 12-state rigid body of Ru (2017) with first-order rotors, z down, integrated by RK4 with
+    the rotor lag in closed form. The registered ids differ in their default reference, start and limits only.
 
     ## Action Space
-    `Box(-1, 1, (4,), float32)`: rotor force commands. -1 is no force, 0 hover (m g / 4), +1 kappa m g; linear in between.
-    A non-finite action raises ValueError; one outside the box is clipped and counted (`info["clipped_actions"]`).
+    `Box(-1, 1, (4,), float32)`: rotor force commands. -1 is no force, 0 hover (m g / 4), +1 kappa m g; linear
+    in between. A non-finite action raises ValueError; one outside the box is clipped and counted
+    (`info["clipped_actions"]`).
 
     ## Observation Space
     One flat float32 Box, see `quad_envs.observations`: `env.unwrapped.task.layout.slices` names the parts and
-    `layout.decode` takes them apart. It holds the vehicle's own state, the last command and the coming reference
-    relative to the vehicle.
+    `layout.decode` takes them apart. It holds the vehicle's own state, the last command and the coming
+    reference relative to the vehicle.
 
     ## Rewards
-    `(1 - v) / (1 + l)` with the stage cost l = |x - x_ref|_Q^2 + |u - u_T|_R^2 and v in [0, 1] the violation of the
-    limits; 0 in the step of a crash. `reward="quadratic"` gives -l - v instead.
+    `(1 - v) / (1 + l)` with the stage cost l = |x - x_ref|_Q^2 + |u - u_T|_R^2 and v in [0, 1] the violation
+    of the limits; 0 in the step of a crash. `reward="quadratic"` gives -l - v instead.
 
     ## Starting State
-    Hover at `start`, each component drawn from +- `start_box`. `reset(options={"state": x})` puts the plant elsewhere.
+    Hover at `start`, each component drawn from +- `start_box`. `reset(options={"state": x})` puts the plant
+    elsewhere.
 
     ## Episode Termination
-    Crash: |roll| or |pitch| >= 85 degrees, farther than `lost_distance` from the reference, or a state that is no longer
-    finite. Truncation after `time_limit`.
+    Crash: |roll| or |pitch| >= 85 degrees, farther than `lost_distance` from the reference, or a state that
+    is no longer finite. Truncation after `time_limit`.
 
     ## Info
-    At every step and at reset: `cost` (sum of hinge / scale over the limits), `episode_cost` (its running sum),
-    `constraint_violation` (bool), `constraint_values` (value minus limit of each of `task.constraint_names`),
-    `stage_cost`, `crashed`, `clipped_actions`.
+    At every step and at reset: `cost` (sum of hinge / scale over the limits), `episode_cost` (its running
+    sum), `constraint_violation` (bool), `constraint_values` (value minus limit of each of
+    `task.constraint_names`), `stage_cost`, `crashed`, `clipped_actions`.
 
     ## Arguments
-    Vehicle: `mass` 0.8 kg, `gravity` 9.8 m/s^2, `inertia` (0.0224, 0.0224, 0.0436) kg m^2, `arm` 0.165 m, `yaw_moment`
+    Vehicle: `mass` 0.8 kg, `gravity` 9.8 m/s^2, `inertia` (0.0224, 0.0224, 0.0436) kg m^2, `arm` 0.165 m,
+    `yaw_moment`
         0.002167 m, `rotor_rate` 50 1/s, `drag` 0 kg/s.
-    Limits: `kappa` 1 (largest rotor force as a fraction of the weight, in (1/4, 1]), `rate_limit` N/s per rotor,
+    Limits: `kappa` 1 (largest rotor force as a fraction of the weight, in (1/4, 1]), `rate_limit` N/s per
+    rotor,
         `tilt_limit` rad on |roll| and |pitch|, `velocity_limit` m/s on each body velocity, `position_limit`
         ((x, y, z) lower, (x, y, z) upper) m. No limit but kappa by default.
-    Task: `reference` (a name, a .csv path or a Reference), `start` (3 or 12 numbers), `start_box` (half widths: 1 or 3
-        numbers of the position or 12 of the state), `time_limit` 10 s, `dt` 0.05 s, `substeps` 5, `preview` 25 stages
-        of the reference in the observation, `Q` and `R` (diagonals, 1), `reward` "bounded" or "quadratic",
-        `lost_distance` 50 m.
-    Uncertainty: `disturbance` (a name, a Disturbance or None), `reveal_disturbance` (puts its mean over the coming
-        period into the observation), `sensor_noise` (standard deviations of position m, velocity m/s, attitude rad,
-        rates rad/s, or one number for all), `randomize` (relative spread of mass, inertia, arm, kappa, rotor_rate,
-        drag at reset: a mapping or one number for all).
+    Task: `reference` (a name, a .csv path or a Reference), `start` (3 or 12 numbers), `start_box` (half
+    widths: 1 or 3
+        numbers of the position or 12 of the state), `time_limit` 10 s, `dt` 0.05 s, `substeps` 5, `preview`
+        25 stages of the reference in the observation, `Q` and `R` (diagonals, 1), `reward` "bounded" or
+        "quadratic", `lost_distance` 50 m.
+    Uncertainty: `disturbance` (a name, a Disturbance or None), `reveal_disturbance` (puts its mean over the
+    coming
+        period into the observation), `sensor_noise` (standard deviations of position m, velocity m/s,
+        attitude rad, rates rad/s, or one number for all), `randomize` (relative spread of mass, inertia, arm,
+        kappa, rotor_rate, drag at reset: a mapping or one number for all).
 
     ## References
     G. Ru, Nonlinear Model Predictive Control for Cooperative Control and Estimation, 2017, chapters 2 to 4.
@@ -89,7 +93,7 @@ class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Views of the batch's only row, made once because slicing takes longer than reading."""
         row = self._batch.rows[0]
         self._scores, self._plant = row[SCORES], row[PLANT]
-        self._values = row[VALUES : VALUES + len(constraint_names(self.task.limits))]
+        self._values = row[VALUES : VALUES + len(self.task.constraint_names)]
         self._size = self.task.layout.size
 
     def __getstate__(self) -> dict[str, Any]:
@@ -107,13 +111,13 @@ class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     @property
     def state(self) -> Array:
-        """Copy of the plant state [p, V_B, Theta, Omega, F], (16,). For study and tests; policies never see it."""
-        return self._plant.copy()
+        """Copy of the plant [p, V_B, Theta, Omega, F], (16,), for study and tests; policies never see it."""
+        return np.array(self._plant)
 
     @property
     def reference(self) -> Array:
         """Copy of this episode's reference rows from the start on, (n_steps, 8). For study and tests."""
-        return self._batch.references[0].copy()
+        return np.array(self._batch.references[0])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

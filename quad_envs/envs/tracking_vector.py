@@ -13,7 +13,6 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from ..constraints import constraint_names
 from ..parameters import Array
 from ..tasks import Task
 from .batch import TrackingBatch
@@ -71,13 +70,14 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.floa
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"render_modes": [], "render_fps": 20, "autoreset_mode": self.autoreset_mode}
         self._batch = TrackingBatch(options, num_envs)
-        self._n_values = len(constraint_names(self.task.limits))
+        self._n_values = len(self.task.constraint_names)
         self.single_action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (self.task.layout.size,), np.float32)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._generators: list[np.random.Generator] = []
         self._done = np.zeros(num_envs, dtype=np.bool_)
+        self._last: Observations = self._fresh_observations()
 
     @property
     def task(self) -> Task:
@@ -149,14 +149,14 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.floa
         return observations, rewards, terminated, truncated, info
 
     def _reset_rows(self, which: Bools, observations: Observations) -> None:
-        for i in np.flatnonzero(which):
-            self._batch.reset_row(int(i), self._generators[i], observations[i])
+        for i in np.flatnonzero(which).tolist():
+            self._batch.reset_row(i, self._generators[i], observations[i])
 
     def _reset_in_same_step(self, observations: Observations, info: dict[str, Any]) -> dict[str, Any]:
         """Begin anew where an episode ended; what was before travels in `final_obs` and `final_info`."""
         done = self._done
         final = np.full(self.num_envs, None, dtype=object)
-        for i in np.flatnonzero(done):
+        for i in np.flatnonzero(done).tolist():
             final[i] = observations[i].copy()
         self._reset_rows(done, observations)
         fresh = self._info()
@@ -180,7 +180,7 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.floa
         fresh = [seeding.np_random(value)[0] for value in seeds]
         if not self._generators:
             self._generators = fresh
-        for i in np.flatnonzero(mask):
+        for i in np.flatnonzero(mask).tolist():
             if seeds[i] is not None:
                 self._generators[i] = fresh[i]
 

@@ -1,0 +1,300 @@
+"""The single tracking environment: reward, limits, observation, disturbances, reset and bad input."""
+
+import math
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import quad_envs
+from quad_envs.constraints import constraint_scales, constraint_values, forces_from_actions
+from quad_envs.dynamics import derivative_reference, simulate
+from quad_envs.reward import stage_cost
+
+HELIX = "quad/HelixTracking-v0"
+LIMITS = {
+    "kappa": 0.3125,
+    "rate_limit": 5.0,
+    "tilt_limit": 0.2,
+    "velocity_limit": 1.0,
+    "position_limit": ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)),
+}
+
+
+def make(**kwargs):
+    return gym.make(HELIX, **kwargs)
+
+
+def flight(env, steps=60, seed=0, scale=0.3):
+    """Observations, rewards, infos, states and actions of a flight with random actions."""
+    rng = np.random.default_rng(seed)
+    observation, info = env.reset(seed=seed)
+    out = [(observation, None, info, env.unwrapped.state, None)]
+    for _ in range(steps):
+        action = rng.uniform(-scale, scale, 4).astype(np.float32)
+        observation, reward, terminated, truncated, info = env.step(action)
+        out.append((observation, reward, info, env.unwrapped.state, action))
+        if terminated or truncated:
+            break
+    return out
+
+
+def test_the_step_is_the_plant_held_over_the_control_period():
+    env = make()
+    before = None
+    for _, _, _, state, action in flight(env, 20):
+        if before is not None:
+            command = forces_from_actions(
+                action, env.unwrapped.task.hover_force, env.unwrapped.task.force_max
+            )
+            assert np.array_equal(state, simulate(before, command, env.unwrapped.task.params))
+        before = state
+
+
+def test_reward_and_stage_cost_are_the_readable_formulas():
+    env = make(**LIMITS, Q=tuple(np.linspace(0.5, 2.0, 12)), R=(1.0, 2.0, 3.0, 4.0))
+    task, reference = env.unwrapped.task, env.unwrapped.reference
+    previous = np.full(4, 1.96)
+    violated = 0
+    for k, (_, reward, info, state, action) in enumerate(flight(env)):
+        command = (
+            previous if action is None else forces_from_actions(action, task.hover_force, task.force_max)
+        )
+        cost = stage_cost(state, reference[k], command, task.hover_force, task.weights)
+        values = constraint_values(state, command, previous, task.limits, task.dt)
+        hinge = np.where(values > 1e-5, values, 0.0) / constraint_scales(task.limits, task.dt)
+        assert info["stage_cost"] == pytest.approx(cost, rel=1e-10)
+        np.testing.assert_allclose(info["constraint_values"], values, atol=1e-9)
+        assert info["cost"] == pytest.approx(hinge.sum(), abs=1e-7)
+        if reward is not None and not info["crashed"]:
+            assert reward == pytest.approx((1 - min(1.0, hinge.sum())) / (1 + cost), abs=1e-7)
+        violated += info["constraint_violation"]
+        previous = command
+    assert violated > 5
+
+
+def test_episode_cost_is_the_running_sum_of_cost():
+    infos = [info for _, _, info, _, _ in flight(make(**LIMITS))]
+    costs = [info["cost"] for info in infos]
+    np.testing.assert_allclose([info["episode_cost"] for info in infos], np.cumsum(costs))
+
+
+def test_constraint_rows_are_named_and_present_only_where_limited():
+    assert make().unwrapped.task.constraint_names == ()
+    assert make(**LIMITS).unwrapped.task.constraint_names == ("tilt", "velocity", "position", "rate")
+    assert make(rate_limit=5.0).unwrapped.task.constraint_names == ("rate",)
+
+
+def test_info_has_the_same_keys_at_reset_and_at_every_step():
+    keys = {frozenset(info) for _, _, info, _, _ in flight(make(**LIMITS))}
+    assert len(keys) == 1
+
+
+def test_observation_decodes_to_the_state_and_the_reference():
+    env = make(position_limit=((-9.0,) * 3, (9.0,) * 3))
+    layout, reference = env.unwrapped.task.layout, env.unwrapped.reference
+    for k, (observation, _, _, state, action) in enumerate(flight(env, 30)):
+        view = layout.decode(observation)
+        own = np.concatenate([view.position, view.V_B, view.Theta, view.Omega, view.F])
+        np.testing.assert_allclose(own, state, rtol=1e-6, atol=1e-6)
+        window = reference[k : k + 26].copy()
+        window[:, :3] -= state[:3]
+        np.testing.assert_allclose(view.preview, window, rtol=1e-6, atol=1e-6)
+        if action is not None:
+            np.testing.assert_allclose(view.last_command, forces_from_actions(action, 1.96, 7.84), rtol=1e-6)
+
+
+def test_slices_cover_the_observation_without_overlap():
+    layout = make(position_limit=((-9.0,) * 3, (9.0,) * 3), reveal_disturbance=True).unwrapped.task.layout
+    parts = [s for name, s in layout.slices.items() if name != "own"]
+    covered = np.concatenate([np.arange(s.start, s.stop) for s in parts])
+    assert np.array_equal(covered, np.arange(layout.size))
+
+
+def test_revealed_disturbance_is_the_one_that_acts():
+    env = make(
+        disturbance=quad_envs.Steady(force=(0.5, 0.0, -0.2), torque=(0.01, 0.02, 0.0)),
+        reveal_disturbance=True,
+        start_box=0.0,
+    )
+    observation, _ = env.reset(seed=0)
+    view = env.unwrapped.task.layout.decode(observation)
+    np.testing.assert_allclose([*view.torque, *view.force], [0.01, 0.02, 0, 0.5, 0, -0.2], rtol=1e-6)
+    before = env.unwrapped.state
+    env.step(np.zeros(4, np.float32))
+    rate = derivative_reference(before[:12], before[12:], env.unwrapped.task.params, view.torque, view.force)
+    after = env.unwrapped.state
+    # first order in dt = 0.05 s
+    np.testing.assert_allclose((after - before)[3:6] / 0.05, rate[3:6], atol=0.05)
+    np.testing.assert_allclose((after - before)[9:11] / 0.05, rate[9:11], atol=1e-6)
+
+
+def test_a_disturbance_pulse_moves_the_vehicle_only_while_it_acts():
+    env = make(disturbance="torque-pulse", reference="setpoint", start_box=0.0)
+    env.reset(seed=0)
+    hover = np.zeros(4, np.float32)
+    for _ in range(100):
+        env.step(hover)
+    np.testing.assert_allclose(env.unwrapped.state[:12], 0.0, atol=1e-12)
+    env.step(hover)
+    assert np.abs(env.unwrapped.state[9:11]).max() > 0.1
+
+
+def test_sensor_noise_has_its_deviations_and_leaves_the_plant_alone():
+    deviations = (0.1, 0.2, 0.01, 0.02)
+    noisy, clean = flight(make(sensor_noise=deviations), 199, scale=0.0), flight(make(), 199, scale=0.0)
+    layout = make().unwrapped.task.layout
+    assert all(np.array_equal(a[3], b[3]) for a, b in zip(noisy, clean, strict=True))
+    error = [layout.decode(a[0]).V_B - layout.decode(b[0]).V_B for a, b in zip(noisy, clean, strict=True)]
+    # 600 samples: the deviation is known to 3 %; five of those
+    assert np.std(error) == pytest.approx(0.2, rel=0.15)
+    error = [
+        layout.decode(a[0]).preview[0, :3] - layout.decode(b[0]).preview[0, :3]
+        for a, b in zip(noisy, clean, strict=True)
+    ]
+    assert np.std(error) == pytest.approx(0.1, rel=0.15)
+
+
+def test_randomized_vehicles_differ_within_their_spread_and_the_task_keeps_the_nominal_one():
+    env = make(randomize={"mass": 0.2}, start_box=0.0)
+    falls = set()
+    for seed in range(20):
+        env.reset(seed=seed)
+        env.step(np.full(4, -1.0, np.float32))
+        env.reset(seed=seed)
+        for _ in range(5):
+            env.step(np.zeros(4, np.float32))
+        velocity = env.unwrapped.state[5]
+        falls.add(round(velocity, 9))
+        # hover thrust of the nominal vehicle on another mass: g (1 - m / m_true) over 0.25 s
+        assert 9.8 * (1 - 1 / 0.8) * 0.26 < velocity < 9.8 * (1 - 1 / 1.2) * 0.26
+    assert len(falls) == 20 and env.unwrapped.task.params.mass == 0.8
+
+
+def test_zero_thrust_falls_out_of_range_and_a_crash_gives_no_reward():
+    env = make(start_box=0.0, time_limit=60.0, lost_distance=10.0)
+    env.reset(seed=0)
+    for _ in range(1200):
+        _, reward, terminated, truncated, info = env.step(np.full(4, -1.0, np.float32))
+        if terminated:
+            break
+    assert terminated and not truncated and info["crashed"] and reward == 0.0
+
+
+def test_flipping_over_is_a_crash_and_the_observation_stays_finite():
+    env = make(start_box=0.0)
+    env.reset(seed=0)
+    for _ in range(200):
+        observation, reward, terminated, _, info = env.step(np.array([0, 1, 0, -1], np.float32))
+        assert np.isfinite(observation).all() and math.isfinite(reward)
+        if terminated:
+            break
+    assert terminated and info["crashed"]
+
+
+def test_episode_is_truncated_at_the_time_limit():
+    env = make(time_limit=1.0)
+    env.reset(seed=0)
+    ends = [env.step(np.zeros(4, np.float32))[2:4] for _ in range(20)]
+    assert ends == [(False, False)] * 19 + [(False, True)]
+
+
+def test_a_state_can_be_given_at_reset():
+    env = make()
+    state = np.arange(12) / 20
+    env.reset(seed=0, options={"state": state})
+    assert np.array_equal(env.unwrapped.state[:12], state)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"state": np.zeros(5)}, {"state": np.full(12, np.nan)}, {"start": 1}, {"state": np.full(12, 1.5)}],
+)
+def test_bad_reset_options_are_refused(options):
+    with pytest.raises(ValueError, match="reset option"):
+        make().reset(options=options)
+
+
+def test_same_seed_and_actions_give_the_same_flight_also_after_pickling():
+    env = make(randomize=0.1, sensor_noise=0.01, disturbance="gusts", reference="random")
+    copy = pickle.loads(pickle.dumps(env.unwrapped))
+    for one, other in zip(flight(env), flight(copy), strict=True):
+        assert np.array_equal(one[0], other[0]) and one[1] == other[1]
+
+
+def test_a_pickle_in_mid_flight_continues_the_same_flight():
+    env = make().unwrapped
+    flight(env, 10)
+    copy = pickle.loads(pickle.dumps(env))
+    action = np.array([0.1, 0.0, -0.1, 0.2], np.float32)
+    for _ in range(10):
+        assert np.array_equal(env.step(action)[0], copy.step(action)[0])
+
+
+@pytest.mark.parametrize("index", range(4))
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_non_finite_action_is_named_and_moves_nothing(index, value):
+    env = make().unwrapped
+    env.reset(seed=0)
+    before = env.state
+    action = np.zeros(4, np.float32)
+    action[index] = value
+    with pytest.raises(ValueError, match=rf"action\[{index}\]"):
+        env.step(action)
+    assert np.array_equal(env.state, before)
+
+
+@pytest.mark.parametrize("shape", [(3,), (1, 4), (), (4, 1)])
+def test_an_action_of_another_shape_is_refused(shape):
+    env = make().unwrapped
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"shape \(4,\)"):
+        env.step(np.zeros(shape, np.float32))
+
+
+def test_an_action_out_of_range_is_clipped_and_counted():
+    env, clipped = make().unwrapped, make().unwrapped
+    env.reset(seed=0)
+    clipped.reset(seed=0)
+    observation, *_, info = env.step(np.array([2.0, -3.0, 0.5, 1.0], np.float32))
+    assert info["clipped_actions"] == 2
+    assert np.array_equal(observation, clipped.step(np.array([1.0, -1.0, 0.5, 1.0], np.float32))[0])
+
+
+def test_quadratic_reward_is_minus_cost_and_penalty():
+    env = make(reward="quadratic", **LIMITS)
+    for _, reward, info, _, _ in flight(env)[1:]:
+        assert reward == pytest.approx(-info["stage_cost"] - min(1.0, info["cost"]))
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "error", "message"),
+    [
+        ({"kapa": 0.5}, TypeError, "did you mean 'kappa'"),
+        ({"kappa": 0.2}, ValueError, "kappa"),
+        ({"dt": -1.0}, ValueError, "dt"),
+        ({"substeps": 0}, ValueError, "substeps"),
+        ({"preview": 2.5}, ValueError, "preview"),
+        ({"time_limit": 0.01}, ValueError, "time_limit"),
+        ({"reward": "sparse"}, ValueError, "reward"),
+        ({"start": (1.0, 2.0)}, ValueError, "start"),
+        ({"start": (0.0,) * 6 + (1.5,) + (0.0,) * 5}, ValueError, "start roll"),
+        ({"start_box": -1.0}, ValueError, "start_box"),
+        ({"sensor_noise": -0.1}, ValueError, "sensor_noise"),
+        ({"randomize": {"weight": 0.1}}, ValueError, "randomize"),
+        ({"randomize": {"drag": 0.1}}, ValueError, "drag"),
+        ({"randomize": 1.5}, ValueError, "spread"),
+        ({"randomize": 0.5, "kappa": 0.3}, ValueError, "too weak to hover"),
+        ({"position_limit": ((1.0,) * 3, (0.0,) * 3)}, ValueError, "position limit"),
+        ({"reference": "circle"}, ValueError, "reference"),
+        ({"disturbance": "wind"}, ValueError, "disturbance"),
+        ({"Q": (1.0, 2.0)}, ValueError, "Q"),
+        ({"R": 0.0}, ValueError, "R"),
+        ({"render_mode": "ansi"}, ValueError, "render_mode"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.*render_mode.*")
+def test_a_bad_argument_is_refused_when_the_environment_is_made(kwargs, error, message):
+    with pytest.raises(error, match=message):
+        make(**kwargs)
