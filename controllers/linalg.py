@@ -65,6 +65,22 @@ def add_matvec_transposed(A: Array, x: Array, sign: float, out: Array) -> None:
 
 
 @kernel
+def copy(A: Array, out: Array) -> None:
+    """A (n, m) into out. A slice assignment would compile four times as long."""
+    for i in range(A.shape[0]):
+        for j in range(A.shape[1]):
+            out[i, j] = A[i, j]
+
+
+@kernel
+def fill(out: Array, value: float) -> None:
+    """The value into every entry of out (n, m)."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = value
+
+
+@kernel
 def transpose(A: Array, out: Array) -> None:
     """The transpose of A (n, m) into out (m, n)."""
     for i in range(A.shape[0]):

@@ -14,7 +14,7 @@ import numpy as np
 from quad_envs._numba import kernel
 from quad_envs.parameters import Array
 
-from .linalg import add_matvec_transposed, lu_solve, matmul, symmetrise, transpose
+from .linalg import add_matvec_transposed, copy, fill, lu_solve, matmul, symmetrise, transpose
 
 DARE_SCRATCH = 10  # (n, n) matrices of scratch that `solve_dare` needs
 RICCATI_SCRATCH = 6  # (n, n) matrices of scratch that the finite-horizon passes need
@@ -29,14 +29,12 @@ def _start_doubling(A: Array, B: Array, Q: Array, R: Array, A_k: Array, G: Array
     n, m = B.shape
     R_copy = scratch[0].reshape(-1)[: m * m].reshape(m, m)
     solved = scratch[1, :m]  # R^-1 B'
-    R_copy[:, :] = R
+    copy(R, R_copy)
     transpose(B, solved)
     lu_solve(R_copy, solved)
     matmul(B, solved, G)
-    for i in range(n):
-        for j in range(n):
-            A_k[i, j] = A[i, j]
-            H[i, j] = Q[i, j]
+    copy(A, A_k)
+    copy(Q, H)
 
 
 @kernel
@@ -102,7 +100,7 @@ def solve_dare(A: Array, B: Array, Q: Array, R: Array, P: Array, scratch: Array)
         if increment <= _DARE_TOLERANCE * largest:
             doublings = k + 1
             break
-    P[:, :] = H
+    copy(H, P)
     return doublings
 
 
@@ -223,8 +221,8 @@ def riccati_pass(
     """
     N, n = c.shape
     P, work = scratch[0], scratch[1:]
-    P[:, :] = Q_f
-    P_c[:, :] = 0.0
+    copy(Q_f, P)
+    fill(P_c, 0.0)
     for j in range(A.shape[0]):
         transpose(A[j], transposed[j, :n])
         transpose(B[j], transposed[j, n:])
@@ -301,7 +299,9 @@ def optimal_plan(
     """
     N, n = c.shape
     s, y, t = scratch[0, 0], scratch[0, 1], scratch[0, 2]
-    s[:] = 0.0
+    for a in range(n):
+        s[a] = 0.0
+        x[0, a] = x_0[a]
     add_matvec_transposed(Q_f, r[N], -1.0, s)
     for i in range(N - 1, -1, -1):
         j = i if B.shape[0] > 1 else 0
@@ -313,7 +313,6 @@ def optimal_plan(
         if i > 0:
             add_matvec_transposed(A_cl[g], y, 1.0, s)
             add_matvec_transposed(Q[i if Q.shape[0] > 1 else 0], r[i], -1.0, s)
-    x[0, :] = x_0
     for i in range(N):
         g = 0 if stationary else i
         for a in range(u.shape[1]):
@@ -329,7 +328,8 @@ def step_plan(transposed: Array, c: Array, i: int, u: Array, x: Array) -> None:
     """x_{i+1} = A_i x_i + B_i u_i + c_i, with [A_i B_i]' as `riccati_pass` leaves it."""
     j = i if transposed.shape[0] > 1 else 0
     n = x.shape[1]
-    x[i + 1, :] = c[i]
+    for a in range(n):
+        x[i + 1, a] = c[i, a]
     add_matvec_transposed(transposed[j, :n], x[i], 1.0, x[i + 1])
     add_matvec_transposed(transposed[j, n:], u[i], 1.0, x[i + 1])
 

@@ -6,8 +6,8 @@ face) or saturated: violated with its multiplier at the weight, which makes it a
 exact L1 penalty needs no slack variable.
 
 With q working normals N_W the kernels keep J = [J_1 J_2] with J J' = H^-1, J_2'N_W = 0, and the triangular R
-with J_1'N_W = R. J is stored by columns (J_T[k] is column k) and starts lower triangular: `first[k]` is the
-first entry of column k that may be non-zero, a multiple of 4. R is stored by columns as well.
+with J_1'N_W = R, both stored by columns (J_T[k] is column k). A loop that starts at max(start, 0) tells the
+compiler that no index counts from the end: only then is it vectorised.
 """
 
 from __future__ import annotations
@@ -156,38 +156,36 @@ def _state_normal(h: Array, stage: int, sign: float, A: Array, B: Array, y: Arra
 
 
 @kernel
-def _project(J_T: Array, first: IntArray, a: Array, start: int, stop: int, d: Array) -> float:
-    """d = J'a and |d|^2; a is zero outside start..stop. Four partial sums, so that the loop vectorises."""
+def _project(J_T: Array, a: Array, start: int, stop: int, d: Array) -> float:
+    """d = J'a and |d|^2; a is zero outside start..stop. Four columns at a time, to overlap their sums."""
     total = 0.0
-    for k in range(J_T.shape[0]):
+    for k in range(0, J_T.shape[0], 4):
         s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
-        for j in range(max(start, first[k]), stop, 4):
-            s0 += J_T[k, j] * a[j]
-            s1 += J_T[k, j + 1] * a[j + 1]
-            s2 += J_T[k, j + 2] * a[j + 2]
-            s3 += J_T[k, j + 3] * a[j + 3]
-        value = (s0 + s1) + (s2 + s3)
-        d[k] = value
-        total += value * value
+        for j in range(max(start, 0), stop):
+            value = a[j]
+            s0 += J_T[k, j] * value
+            s1 += J_T[k + 1, j] * value
+            s2 += J_T[k + 2, j] * value
+            s3 += J_T[k + 3, j] * value
+        d[k], d[k + 1], d[k + 2], d[k + 3] = s0, s1, s2, s3
+        total += (s0 * s0 + s1 * s1) + (s2 * s2 + s3 * s3)
     return total
 
 
 @kernel
-def _primal_direction(J_T: Array, first: IntArray, d: Array, q: int, z: Array) -> tuple[float, int]:
-    """z = J_2 d_2; returns |d_2|^2 and the first entry of z that may be non-zero."""
+def _primal_direction(J_T: Array, d: Array, q: int, z: Array) -> float:
+    """z = J_2 d_2 and |d_2|^2."""
     nv = J_T.shape[0]
     zeta = 0.0
-    start = nv
     for j in range(nv):
         z[j] = 0.0
     for k in range(q, nv):
         factor = d[k]
         if factor != 0.0:
             zeta += factor * factor
-            start = min(start, first[k])
-            for j in range(first[k], nv):
+            for j in range(nv):
                 z[j] += factor * J_T[k, j]
-    return zeta, start
+    return zeta
 
 
 @kernel
@@ -223,46 +221,37 @@ def _first_to_leave(
 
 
 @kernel
-def _widen(J_T: Array, first: IntArray, k: int, start: int) -> None:
-    """Makes column k of J valid from entry start."""
-    for j in range(start, first[k]):
-        J_T[k, j] = 0.0
-    first[k] = min(first[k], start)
+def _append(J_T: Array, R_T: Array, d: Array, q: int) -> None:
+    """Adds the row with d = J'a to the working set: rotations leave one entry in d_2, which extends R.
+
+    A reflection would need fewer operations but fill J; rotations of neighbours keep most of its zeros, and with
+    them those of d.
+    """
+    nv = J_T.shape[0]
+    for k in range(nv - 1, q, -1):
+        g = d[k]
+        if g != 0.0:
+            f = d[k - 1]
+            length = math.sqrt(f * f + g * g)
+            d[k - 1] = length
+            _rotate(J_T[k - 1], J_T[k], f / length, g / length)
+    for i in range(q + 1):
+        R_T[q, i] = d[i]
 
 
 @kernel
-def _append(J_T: Array, R_T: Array, first: IntArray, d: Array, z: Array, zeta: float, start: int, q: int) -> None:
-    """Adds the row with d = J'a to the working set: reflects J_2 so that d_2 has one entry, and extends R.
-
-    The reflection I - beta v v', v = d_2 - delta e_1, needs w = J_2 v = z - delta J_q: z is known already, so this
-    costs one pass over J_2, a third of a sweep of Givens rotations.
-    """
-    nv = J_T.shape[0]
-    norm = math.sqrt(zeta)
-    delta = -norm if d[q] > 0.0 else norm
-    _widen(J_T, first, q, start)
-    start = first[q]
-    v_q = d[q] - delta
-    beta = 1.0 / (norm * (norm + abs(d[q])))
-    for j in range(start, nv):
-        z[j] -= delta * J_T[q, j]
-    d[q] = v_q
-    for k in range(q, nv):
-        if d[k] != 0.0:
-            _widen(J_T, first, k, start)
-            factor = beta * d[k]
-            for j in range(start, nv):
-                J_T[k, j] -= factor * z[j]
-    for i in range(q):
-        R_T[q, i] = d[i]
-    R_T[q, q] = delta
+def _rotate(v: Array, w: Array, cos: float, sin: float) -> None:
+    """(v, w) becomes (cos v + sin w, cos w - sin v)."""
+    for j in range(v.shape[0]):
+        f, g = v[j], w[j]
+        v[j] = cos * f + sin * g
+        w[j] = cos * g - sin * f
 
 
 @kernel
 def _remove(
     J_T: Array,
     R_T: Array,
-    first: IntArray,
     active: IntArray,
     sign: Array,
     nu: Array,
@@ -271,7 +260,6 @@ def _remove(
     q: int,
 ) -> None:
     """Takes working row `leaving` out of q; entry q (the row on its way in) moves to q - 1. R stays triangular."""
-    nv = J_T.shape[0]
     for j in range(leaving, q):
         active[j], sign[j], nu[j], cap[j] = active[j + 1], sign[j + 1], nu[j + 1], cap[j + 1]
     for j in range(leaving, q - 1):
@@ -287,32 +275,26 @@ def _remove(
             f, g = R_T[j, k], R_T[j, k + 1]
             R_T[j, k] = cos * f + sin * g
             R_T[j, k + 1] = cos * g - sin * f
-        start = min(first[k], first[k + 1])
-        _widen(J_T, first, k, start)
-        _widen(J_T, first, k + 1, start)
-        for j in range(start, nv):
-            f, g = J_T[k, j], J_T[k + 1, j]
-            J_T[k, j] = cos * f + sin * g
-            J_T[k + 1, j] = cos * g - sin * f
+        _rotate(J_T[k], J_T[k + 1], cos, sin)
 
 
 @kernel
-def _move(u: Array, z: Array, start: int, t: float, nu: Array, r: Array, q: int, primal: bool) -> None:
+def _move(u: Array, z: Array, t: float, nu: Array, r: Array, q: int, primal: bool) -> None:
     """One step of length t: multipliers along -r (own multiplier up), inputs along z."""
     for i in range(q):
         nu[i] -= t * r[i]
     nu[q] += t
     if primal:
-        flat = u.reshape(-1)
-        for j in range(start, flat.shape[0]):
-            flat[j] += t * z[j]
+        m = u.shape[1]
+        for i in range(u.shape[0]):
+            for a in range(m):
+                u[i, a] += t * z[m * i + a]
 
 
 @kernel
 def _enter(
     J_T: Array,
     R_T: Array,
-    first: IntArray,
     a: Array,
     a_start: int,
     a_stop: int,
@@ -333,8 +315,8 @@ def _enter(
     d, z, r, sign, nu, cap = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4], vectors[5]
     while iterations < iteration_limit:
         iterations += 1
-        length = _project(J_T, first, a, a_start, a_stop, d)
-        zeta, start = _primal_direction(J_T, first, d, q, z)
+        length = _project(J_T, a, a_start, a_stop, d)
+        zeta = _primal_direction(J_T, d, q, z)
         _solve_triangle(R_T, d, q, r)
         dual, leaving, at_cap = _first_to_leave(nu, r, cap, q)
         full = -slack / zeta if zeta > _DEPENDENT * length else math.inf
@@ -343,11 +325,11 @@ def _enter(
         if t == math.inf:
             return q, iterations, INFEASIBLE
         primal = full < math.inf
-        _move(u, z, start, t, nu, r, q, primal)
+        _move(u, z, t, nu, r, q, primal)
         if primal:
             slack += t * zeta
         if full <= dual and full <= own:
-            _append(J_T, R_T, first, d, z, zeta, start, q)
+            _append(J_T, R_T, d, q)
             state[active[q]] = _WORKING
             return q + 1, iterations, OPTIMAL
         if own <= dual:
@@ -356,7 +338,7 @@ def _enter(
             return q, iterations, OPTIMAL
         saturates = at_cap == (sign[leaving] > 0.0)
         state[active[leaving]] = _SATURATED if saturates else _INACTIVE
-        _remove(J_T, R_T, first, active, sign, nu, cap, leaving, q)
+        _remove(J_T, R_T, active, sign, nu, cap, leaving, q)
         q -= 1
     return q, iterations, ITERATION_LIMIT
 
@@ -385,7 +367,6 @@ def dual_active_set(
     multipliers: Array,
     J_T: Array,
     R_T: Array,
-    first: IntArray,
     active: IntArray,
     spans: IntArray,
     state: ByteArray,
@@ -416,7 +397,6 @@ def dual_active_set(
         multipliers: Result, (16N + 2K,), in the numbering of the rows.
         J_T: Inverse factor of the Hessian by columns, (4N, 4N); destroyed.
         R_T: Overwritten, (4N, 4N).
-        first: As left by `inverse_factor`, (4N,).
         active: Overwritten, (4N + 1,).
         spans: As left by `row_spans`.
         state: All rows inactive (zero) on entry, (16N + 2K,).
@@ -450,12 +430,13 @@ def dual_active_set(
                 normals[normal[k]], stage[k], side * sign[q], A, B, vectors[0, :12], vectors[1, :12], a
             )
         q, iterations, status = _enter(
-            J_T, R_T, first, a, a_start, a_stop, slack, u, state, active, vectors, q, iterations, iteration_limit
+            J_T, R_T, a, a_start, a_stop, slack, u, state, active, vectors, q, iterations, iteration_limit
         )
         if status != OPTIMAL:
             break
         row, slack = _worst_input_row(u, lower, upper, rate_step, first_move, state)
-        if K > 0:
+        if row < 0 and K > 0:
+            # Input rows first: following the states costs as much as a step.
             for i in range(N):
                 step_plan(transposed, c, i, u, x)
             row, slack = _worst_state_row(
@@ -510,5 +491,5 @@ def worst_row(
     if normal.shape[0] == 0:
         return row, slack
     return _worst_state_row(
-        x, normals, normal, stage, row_lower, row_upper, weight, spans, 4 * u.size, state, row, slack
+        x, normals, normal, stage, row_lower, row_upper, weight, spans, 4 * u.shape[0] * u.shape[1], state, row, slack
     )

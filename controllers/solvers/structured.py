@@ -16,7 +16,7 @@ import numpy as np
 from quad_envs._numba import kernel
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 
-from ..linalg import matmul
+from ..linalg import fill
 from ..ocp import IntArray, OcpQp, validate
 from ..riccati import RICCATI_SCRATCH, optimal_plan, riccati_pass
 from .active_set import (
@@ -48,7 +48,7 @@ class Workspace(NamedTuple):
     wide: Array  # (2, 12, 4N)
     factors: Array  # (2, 4N, 4N): J and R, by columns
     vectors: Array  # (N_VECTORS, 4N + 12)
-    indices: IntArray  # (2, 4N + 1)
+    active: IntArray  # (4N + 1,)
     spans: IntArray  # (K, 2)
     state: ByteArray  # (16N + 2K,)
 
@@ -84,7 +84,7 @@ def make_workspace(horizon: int, n_rows: int, n_models: int) -> Workspace:
         wide=np.zeros((2, n, nv)),
         factors=np.zeros((2, nv, nv)),
         vectors=np.zeros((N_VECTORS, nv + n)),
-        indices=np.zeros((2, nv + 1), dtype=np.int64),
+        active=np.zeros(nv + 1, dtype=np.int64),
         spans=np.zeros((n_rows, 2), dtype=np.int64),
         state=np.zeros(4 * nv + 2 * n_rows, dtype=np.int8),
     )
@@ -95,26 +95,33 @@ def _stationary_factor(K: Array, D: Array, A_cl: Array, B: Array, J_T: Array, wi
     """J of one gain: block Toeplitz, so the first four columns are computed and the others copied."""
     m, n = K.shape
     nv = J_T.shape[0]
-    G, G_next = wide[0].reshape(-1)[: n * m].reshape(n, m), wide[1].reshape(-1)[: n * m].reshape(n, m)
-    matmul(B, D, G)
-    for a in range(m):
-        for b in range(m):
-            J_T[b, a] = D[a, b]
-    for i in range(m, nv, m):
+    for b in range(m):
         for a in range(m):
-            for b in range(m):
+            J_T[b, a] = D[a, b]
+        for a in range(n):
+            total = 0.0
+            for k in range(b + 1):
+                total += B[a, k] * D[k, b]
+            wide[1, a, b] = total
+    for i in range(1, nv // m):
+        G, G_next = wide[i % 2], wide[1 - i % 2]  # response of x_i to the inputs of stage 0, in the first m columns
+        for b in range(m):
+            for a in range(m):
                 total = 0.0
                 for k in range(n):
                     total += K[a, k] * G[k, b]
-                J_T[b, i + a] = -total
-        matmul(A_cl, G, G_next)
-        for k in range(n):
+                J_T[b, m * i + a] = -total
+        for a in range(n):
             for b in range(m):
-                G[k, b] = G_next[k, b]
+                G_next[a, b] = 0.0
+            for k in range(n):
+                factor = A_cl[a, k]
+                for b in range(m):
+                    G_next[a, b] += factor * G[k, b]
     for k in range(m, nv):
         start = k - k % m
-        for j in range(start, nv):
-            J_T[k, j] = J_T[k % m, j - start]
+        for j in range(nv - start):
+            J_T[k, start + j] = J_T[k % m, j]
 
 
 @kernel
@@ -127,7 +134,7 @@ def _marched_factor(K: Array, D: Array, A_cl: Array, B: Array, J_T: Array, wide:
     for i in range(N):
         X, X_next = wide[i % 2], wide[1 - i % 2]
         w = m * i
-        row = J_T[w]  # the diagonal block is written last, so its first row serves as scratch
+        row = X_next[0]  # scratch until X_next is made
         for a in range(m):
             for k in range(w):
                 row[k] = 0.0
@@ -157,7 +164,7 @@ def _marched_factor(K: Array, D: Array, A_cl: Array, B: Array, J_T: Array, wide:
 
 @kernel
 def inverse_factor(
-    K: Array, D: Array, A_cl: Array, B: Array, stationary: bool, J_T: Array, first: IntArray, wide: Array
+    K: Array, D: Array, A_cl: Array, B: Array, stationary: bool, J_T: Array, wide: Array
 ) -> None:
     """J with J J' = H^-1: J_jj = D_j, J_ij = -K_i A_cl_{i-1} .. A_cl_{j+1} B_j D_j below, 0 above.
 
@@ -167,13 +174,10 @@ def inverse_factor(
         A_cl: Closed loops, (N, 12, 12).
         B: (1 or N, 12, 4).
         stationary: Whether the first gain serves all stages.
-        J_T: Result, J by columns, (4N, 4N); entries before first[k] in column k are not written or are scratch.
-        first: Result, 4 floor(k / 4) for column k.
+        J_T: Result, J by columns, (4N, 4N).
         wide: Overwritten, (2, 12, 4N).
     """
-    m = N_INPUT
-    for k in range(J_T.shape[0]):
-        first[k] = k - k % m
+    fill(J_T, 0.0)
     if stationary:
         _stationary_factor(K[0], D[0], A_cl[0], B[0], J_T, wide)
     else:
@@ -183,8 +187,9 @@ def inverse_factor(
 @kernel
 def _all_finite(values: Array) -> bool:
     bad = 0
-    for value in values.flat:
-        bad |= 0 if abs(value) < math.inf else 1
+    for i in range(values.shape[0]):
+        for j in range(values.shape[1]):
+            bad |= 0 if abs(values[i, j]) < math.inf else 1
     return bad == 0
 
 
@@ -251,13 +256,14 @@ def solve_structured(
         or ws.transposed.shape[0] < A.shape[0]
     ):
         raise ValueError("the workspace does not fit the problem: make it with its horizon, rows and pairs")
-    u, x, n_rows = ws.u, ws.x, 4 * ws.u.size + 2 * K
+    u, x, n_rows = ws.u, ws.x, 4 * N_INPUT * N + 2 * K
     transposed = ws.transposed[: A.shape[0]]
-    ws.multipliers[:n_rows] = 0.0
-    ws.state[:n_rows] = 0
+    for k in range(n_rows):
+        ws.multipliers[k] = 0.0
+        ws.state[k] = 0
     riccati_pass(A, B, c, Q, R, Q_f, stationary, transposed, ws.K, ws.D, ws.A_cl, ws.P_c, ws.scratch)
     optimal_plan(B, c, Q, Q_f, x_0, r, stationary, transposed, ws.K, ws.D, ws.A_cl, ws.P_c, u, x, ws.scratch)
-    if not (_all_finite(x) and _all_finite(u) and _all_finite(r) and _all_finite(u_last.reshape(1, -1))):
+    if not (_all_finite(x) and _all_finite(u) and _all_finite(r) and abs(u_last[0] + u_last[1] + u_last[2] + u_last[3]) < math.inf):
         return NOT_FINITE, 0
     first_move = ws.scratch[0, :2, :N_INPUT]
     for a in range(N_INPUT):
@@ -270,12 +276,12 @@ def solve_structured(
     )  # fmt: skip
     if row < 0:
         return OPTIMAL, 0
-    J_T, first = ws.factors[0], ws.indices[0]
-    inverse_factor(ws.K, ws.D, ws.A_cl, B, stationary, J_T, first, ws.wide)
+    J_T = ws.factors[0]
+    inverse_factor(ws.K, ws.D, ws.A_cl, B, stationary, J_T, ws.wide)
     status, iterations = dual_active_set(
         A, B, c, transposed, lower, upper, rate_step, first_move,
         normals, normal, stage, row_lower, row_upper, weight, row, slack, iteration_limit,
-        u, x, ws.multipliers, J_T, ws.factors[1], first, ws.indices[1], ws.spans, ws.state, ws.vectors,
+        u, x, ws.multipliers, J_T, ws.factors[1], ws.active, ws.spans, ws.state, ws.vectors,
     )  # fmt: skip
     if not (_all_finite(u) and _all_finite(x)):
         return NOT_FINITE, iterations
