@@ -1,0 +1,197 @@
+"""From a flight to the numbers by which policies are compared, and from flights to means with intervals.
+
+The columns stand side by side and are never merged into one. RMS and effort are the dissertation's "average
+RMS" and input effort: means over the samples k = 0..T-1 that were flown. What a crash cuts short, so that it
+would look cheap, is nan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quad_envs.constraints import constraint_names
+from quad_envs.parameters import POSITION, Array
+
+from .rollout import Episode
+
+SETTLED = 0.05  # share of the initial position error below which the vehicle has settled
+SETTLING_LEAST = 0.1  # m, initial position error from which settling means anything
+SATURATED = 1e-6  # N, distance from a face of the rotor box that counts as on it
+
+
+class Record(NamedTuple):
+    """One flight in numbers."""
+
+    seed: int  # of the environment
+    steps: int  # control periods flown
+    score: float  # -, sum of (1 - v) / (1 + l) over the flight / length of the FULL time limit, 0 to 1
+    cost: float  # -, sum of the stage costs l(x_{k+1}, u_k); nan after a crash
+    position_rms: float  # m, sqrt(mean |p_k - p_ref,k|^2); nan after a crash
+    steady_rms: float  # m, the same over the second half of the time limit; nan after a crash
+    effort: float  # N^2, mean |u_k - u_T|^2 of the commands
+    settling_time: float  # s, last sample above 5 % of the initial position error; nan if there is none
+    violation_share: float  # -, share of steps in which a limit was exceeded
+    crashed: bool
+    saturation_share: float  # -, share of rotor commands at a face of the box
+    decision_p50_ms: float  # ms of wall time in predict, median; nan if not timed
+    decision_p99_ms: float  # ms
+    decision_max_ms: float  # ms
+    relaxed: int  # decisions whose hard rows were made soft
+    previous_plan: int  # decisions that took the shifted previous plan
+    clipped_sdre: int  # decisions that took the clipped unconstrained input
+    hover: int  # decisions that took hover thrust
+    iterations_max: int  # most solver iterations of a decision
+    worst_violation: dict[str, float]  # constraint name -> largest excess over its limit, SI
+    agent: str = ""
+
+    def row(self) -> dict[str, Any]:
+        """Flat form for tables: `worst_violation` becomes one column per constraint."""
+        flat = self._asdict()
+        worst = flat.pop("worst_violation")
+        return flat | {f"worst_{name}": value for name, value in worst.items()}
+
+
+# Columns that `summarize` averages; the rest are counted or taken at their worst.
+AVERAGED = (
+    "score",
+    "cost",
+    "position_rms",
+    "steady_rms",
+    "effort",
+    "settling_time",
+    "violation_share",
+    "saturation_share",
+)
+COUNTED = ("crashed", "relaxed", "previous_plan", "clipped_sdre", "hover")
+
+
+def measure(episode: Episode) -> Record:
+    """Reduce a flight to its numbers."""
+    task, steps = episode.task, len(episode.rewards)
+    v = np.minimum(1.0, episode.costs)
+    bounded = (1.0 - v) / (1.0 + episode.stage_costs)
+    if episode.crashed:
+        bounded[-1] = 0.0  # as in the reward, which a wrapper or reward="quadratic" may have replaced
+    error = _position_error(episode)
+    du = episode.commands - task.hover_force
+    excess = np.maximum(episode.constraint_values, 0.0).max(axis=0, initial=0.0)
+    p50, p99, slowest = decision_quantiles(episode.decision_times)
+    return Record(
+        seed=episode.seed,
+        steps=steps,
+        score=float(bounded.sum()) / task.episode_steps,
+        cost=float("nan") if episode.crashed else float(episode.stage_costs.sum()),
+        position_rms=float("nan") if episode.crashed else _rms(error),
+        steady_rms=float("nan") if episode.crashed else _rms(error[task.episode_steps // 2 :]),
+        effort=float((du * du).sum(axis=1).mean()),
+        settling_time=_settling_time(error, task.dt) if not episode.crashed else float("nan"),
+        violation_share=float(episode.violations.mean()),
+        crashed=episode.crashed,
+        saturation_share=_saturation_share(episode.commands, task.force_max),
+        decision_p50_ms=p50,
+        decision_p99_ms=p99,
+        decision_max_ms=slowest,
+        relaxed=int(episode.fallbacks[1]),
+        previous_plan=int(episode.fallbacks[2]),
+        clipped_sdre=int(episode.fallbacks[3]),
+        hover=int(episode.fallbacks[4]),
+        iterations_max=episode.worst_iterations,
+        worst_violation=dict(zip(constraint_names(task.limits), excess.tolist(), strict=True)),
+        agent=episode.agent,
+    )
+
+
+def _position_error(episode: Episode) -> Array:
+    """|p_k - p_ref,k| for k = 0..T-1, (T,); nan where the environment does not show its plant."""
+    steps = len(episode.rewards)
+    if episode.states.shape[1] == 0 or len(episode.references) < steps:
+        return np.full(steps, np.nan)
+    error = episode.states[:steps, POSITION] - episode.references[:steps, POSITION]
+    return np.asarray(np.linalg.norm(error, axis=1))
+
+
+def _rms(error: Array) -> float:
+    return float(np.sqrt(np.mean(error * error))) if error.size else float("nan")
+
+
+def _settling_time(error: Array, dt: float) -> float:
+    """Last sample above 5 % of the initial error, s; nan if it begins small or stays above to the end."""
+    if not error[0] >= SETTLING_LEAST:
+        return float("nan")
+    last = int(np.flatnonzero(error > SETTLED * error[0])[-1])
+    return last * dt if last < len(error) - 1 else float("nan")
+
+
+def _saturation_share(commands: Array, force_max: float) -> float:
+    return float(((commands <= SATURATED) | (commands >= force_max - SATURATED)).mean())
+
+
+def decision_quantiles(seconds: Array) -> tuple[float, float, float]:
+    """Median, 99th percentile and maximum of decision times, ms; nan if none was measured."""
+    timed = seconds[np.isfinite(seconds)]
+    if timed.size == 0:
+        return float("nan"), float("nan"), float("nan")
+    p50, p99 = np.percentile(timed, [50.0, 99.0])
+    return 1e3 * float(p50), 1e3 * float(p99), 1e3 * float(timed.max())
+
+
+class Estimate(NamedTuple):
+    """A mean with its 95 % interval mean +- half_width (Student's t); nan where there are too few values."""
+
+    mean: float
+    half_width: float
+    n: int  # values behind it; those that are nan are left out
+
+
+def estimate(values: Iterable[float]) -> Estimate:
+    """Mean and 95 % interval over flights."""
+    from scipy.special import stdtrit
+
+    x = np.array([value for value in values if np.isfinite(value)], dtype=np.float64)
+    if x.size == 0:
+        return Estimate(float("nan"), float("nan"), 0)
+    if x.size == 1:
+        return Estimate(float(x[0]), float("nan"), 1)
+    t = float(stdtrit(x.size - 1, 0.975))
+    return Estimate(float(x.mean()), t * float(x.std(ddof=1)) / float(np.sqrt(x.size)), x.size)
+
+
+def paired_difference(ours: Sequence[Record], theirs: Sequence[Record], column: str) -> Estimate:
+    """Mean of ours - theirs over flights from the same start.
+
+    The spread between starts is far larger than that between policies on one start.
+
+    Args:
+        ours: Records of one policy.
+        theirs: Records of another in the same environment.
+        column: One of AVERAGED.
+
+    Raises:
+        ValueError: If the column is not averaged, or no seed is in both.
+    """
+    if column not in AVERAGED:
+        raise ValueError(f"column must be one of {', '.join(AVERAGED)}, got {column!r}")
+    other = {(record.seed, record.agent): getattr(record, column) for record in theirs}
+    pairs = [(record, other[key]) for record in ours if (key := (record.seed, record.agent)) in other]
+    if not pairs:
+        raise ValueError("paired_difference needs flights with the same seeds, and these have none in common")
+    return estimate(getattr(record, column) - value for record, value in pairs)
+
+
+def summarize(records: Sequence[Record]) -> dict[str, Estimate]:
+    """Column -> estimate, for every averaged column."""
+    return {name: estimate(getattr(record, name) for record in records) for name in AVERAGED}
+
+
+def totals(records: Sequence[Record]) -> dict[str, int]:
+    """Column -> sum, for every counted column."""
+    return {name: int(sum(getattr(record, name) for record in records)) for name in COUNTED}
+
+
+def worst_violations(records: Sequence[Record]) -> Mapping[str, float]:
+    """Constraint name -> largest excess over all flights, SI."""
+    names = records[0].worst_violation if records else {}
+    return {name: max(record.worst_violation[name] for record in records) for name in names}

@@ -1,0 +1,202 @@
+"""The results folder: written atomically, locked while a sweep runs, and resumable.
+
+config.json        suite, versions, git revision, command
+cells/*.json       one finished unit (environment x policy) each
+episodes/*.npz     flights, if asked for
+results.csv        one row per environment x policy x flight, when all units are finished
+summary.csv        one row per environment x policy
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+import platform
+import socket
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import quad_envs
+
+from .errors import ResultsError
+
+_LOCK = ".lock"
+_DISTRIBUTIONS = ("gymnasium", "pettingzoo", "numpy", "scipy", "numba", "osqp", "joblib")
+
+
+def write_atomic(path: Path, data: bytes) -> None:
+    """Write a file so that it is either complete or not there.
+
+    Raises:
+        ResultsError: If it cannot be written; nothing half-written stays behind.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(temporary, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise ResultsError(
+            f"cannot write {str(path)!r}: {error.strerror or error}; choose another folder, or "
+            "free it and start again: finished units are kept"
+        ) from error
+    finally:
+        try:
+            temporary.unlink(missing_ok=True)
+        except OSError:
+            pass  # the folder itself is not usable, which the error above says
+
+
+def plain_json(value: Any) -> Any:
+    """Nested values as JSON knows them: numpy scalars become numbers, nan and infinity None."""
+    if isinstance(value, Mapping):
+        return {str(key): plain_json(entry) for key, entry in value.items()}
+    if isinstance(value, str) or value is None:
+        return value
+    if isinstance(value, np.ndarray | np.generic):
+        return plain_json(value.tolist())
+    if isinstance(value, Sequence | Iterable):
+        return [plain_json(entry) for entry in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a value as JSON."""
+    write_atomic(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file of the folder.
+
+    Raises:
+        ResultsError: If it cannot be read.
+    """
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise ResultsError(f"cannot read {str(path)!r}: {error}; delete it to fly this unit again") from error
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows with the union of their columns; what is absent or nan stays empty."""
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, columns, restval="")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({key: "" if value is None or value != value else value for key, value in row.items()})
+    write_atomic(path, text.getvalue().encode())
+
+
+def discard(folder: Path) -> None:
+    """Delete the results of an earlier run, and nothing else."""
+    for pattern in ("config.json", "results.csv", "summary.csv", "cells/*.json", "episodes/*.npz"):
+        for path in folder.glob(pattern):
+            path.unlink()
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold the folder for one sweep; makes it if need be.
+
+    Raises:
+        ResultsError: If another process holds it, or it cannot be made.
+    """
+    path = folder / _LOCK
+    owner = {"pid": os.getpid(), "host": socket.gethostname()}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _remove_stale(path)
+        with open(path, "x") as file:
+            json.dump(owner, file)
+    except FileExistsError as error:
+        held = _owner(path)
+        if not folder.is_dir():
+            raise ResultsError(f"{str(folder)!r} is a file, not a folder; choose another one") from error
+        raise ResultsError(
+            f"{str(folder)!r} is in use by process {held.get('pid', '?')} on {held.get('host', '?')}; "
+            f"wait for it, choose another folder, or delete {str(path)!r} if no sweep is running"
+        ) from error
+    except OSError as error:
+        raise ResultsError(
+            f"cannot write into {str(folder)!r}: {error.strerror or error}; choose another folder"
+        ) from error
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def _owner(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _remove_stale(path: Path) -> None:
+    """Remove the lock of a process of this machine that is no more."""
+    owner = _owner(path)
+    if os.name != "posix":
+        return  # elsewhere os.kill(pid, 0) ends the process
+    if owner.get("host") != socket.gethostname() or not isinstance(owner.get("pid"), int):
+        return
+    try:
+        os.kill(owner["pid"], 0)
+    except ProcessLookupError:
+        # Of several processes that see the stale lock, only one succeeds in moving it away.
+        aside = path.with_name(f"{_LOCK}.{os.getpid()}")
+        try:
+            os.rename(path, aside)
+        except FileNotFoundError:
+            return
+        aside.unlink(missing_ok=True)
+    except OSError:
+        return  # alive, and another user's
+
+
+def provenance() -> dict[str, Any]:
+    """Versions, revision and machine, for config.json."""
+    return {
+        "versions": {
+            "quad-envs": quad_envs.__version__,
+            "python": platform.python_version(),
+            **{name: metadata.version(name) for name in _DISTRIBUTIONS},
+        },
+        "git_revision": git_revision(),
+        "platform": platform.platform(),
+        "command": sys.argv,
+    }
+
+
+def git_revision() -> str | None:
+    """Revision of the checkout that quad_envs comes from, with '+' if it has changes; None without one."""
+    package = Path(quad_envs.__file__).resolve().parent
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(package), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    try:
+        if Path(git("rev-parse", "--show-toplevel")).resolve() != package.parent:
+            return None  # installed somewhere below another project's checkout
+        changes = git("status", "--porcelain", "--untracked-files=no")
+        return git("rev-parse", "HEAD") + ("+" if changes else "")
+    except (OSError, subprocess.SubprocessError):
+        return None

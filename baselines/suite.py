@@ -1,0 +1,187 @@
+"""Suites: which policies fly in which environments, read from small TOML files.
+
+name = "mine"
+episodes = 10
+seed = 0
+compare_with = "lmpc"        # label of the policy from which differences are taken
+
+envs = "all"                 # or a list of tables
+[[policies]]
+name = "sdc-nmpc"
+label = "sdc-nmpc, N 15"
+kwargs = {horizon = 15}
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from importlib import resources
+from pathlib import Path
+from typing import Any, TypeVar
+
+from quad_envs.registration import TRACKING
+
+from .errors import unknown_name
+from .policy import TRACKING_POLICIES
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+
+@dataclass(frozen=True, slots=True)
+class EnvChoice:
+    """An environment of a suite."""
+
+    id: str
+    kwargs: dict[str, Any] = field(default_factory=dict)
+    label: str = ""  # for tables; the id and the arguments if empty
+
+    @property
+    def title(self) -> str:
+        """Label for tables."""
+        return self.label or _title(self.id, self.kwargs)
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyChoice:
+    """A policy of a suite."""
+
+    name: str
+    kwargs: dict[str, Any] = field(default_factory=dict)
+    label: str = ""
+
+    @property
+    def title(self) -> str:
+        """Label for tables."""
+        return self.label or _title(self.name, self.kwargs)
+
+
+def _title(name: str, kwargs: Mapping[str, Any]) -> str:
+    return ", ".join([name, *(f"{key}={value}" for key, value in kwargs.items())])
+
+
+@dataclass(frozen=True, slots=True)
+class Suite:
+    """Every policy flies in every environment, from the same seeds.
+
+    Raises:
+        ValueError: If there is nothing to fly, a number is not allowed, or two titles are equal.
+    """
+
+    name: str
+    envs: tuple[EnvChoice, ...]
+    policies: tuple[PolicyChoice, ...]
+    episodes: int = 20  # per environment and policy
+    seed: int = 0  # flight i starts with the environment seed `seed + i`
+    compare_with: str = ""  # title of the policy from which differences are taken; the first if empty
+
+    def __post_init__(self) -> None:
+        for name, least in (("episodes", 1), ("seed", 0)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+                raise ValueError(
+                    f"{name} of suite {self.name!r} must be a whole number >= {least}, got {value!r}"
+                )
+        for kind, choices in (("envs", self.envs), ("policies", self.policies)):
+            titles = [choice.title for choice in choices]
+            if not titles:
+                raise ValueError(f"suite {self.name!r} has no {kind}")
+            for title in titles:
+                if titles.count(title) > 1:
+                    raise ValueError(f"suite {self.name!r} has {title!r} twice in {kind}; give them labels")
+        titles = [policy.title for policy in self.policies]
+        if self.compare_with and self.compare_with not in titles:
+            raise ValueError(unknown_name(f"compare_with of suite {self.name!r}:", self.compare_with, titles))
+
+    @property
+    def base(self) -> str:
+        """Title of the policy from which differences are taken."""
+        return self.compare_with or self.policies[0].title
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain values, the form of the TOML file."""
+        return asdict(self)
+
+
+_Choice = TypeVar("_Choice", EnvChoice, PolicyChoice)
+
+
+def suite_from_dict(data: Mapping[str, Any], name: str = "suite") -> Suite:
+    """A suite from the values of a TOML file.
+
+    Raises:
+        ValueError: If a key is unknown, one that is needed is missing, or a value is not allowed.
+    """
+    known = [entry.name for entry in fields(Suite)]
+    for key in data:
+        if key not in (*known, "description"):
+            raise ValueError(unknown_name(f"key of suite {name!r}:", key, known))
+    for key in ("envs", "policies"):
+        if key not in data:
+            raise ValueError(f'suite {name!r} needs {key}: a list of tables, or "all"')
+    given = {key: value for key, value in data.items() if key != "description"}
+    given["envs"] = _choices(EnvChoice, "id", data["envs"], list(TRACKING), name)
+    given["policies"] = _choices(PolicyChoice, "name", data["policies"], list(TRACKING_POLICIES), name)
+    return Suite(**{"name": name, **given})
+
+
+def _choices(
+    kind: type[_Choice], key: str, entries: Any, every: Sequence[str], suite: str
+) -> tuple[_Choice, ...]:
+    """The tables of a list, or all names."""
+    if entries == "all":
+        entries = [{key: name} for name in every]
+    if not isinstance(entries, Sequence) or isinstance(entries, str):
+        raise ValueError(
+            f'suite {suite!r}: choose from a list of tables with {key!r}, or "all"; got {entries!r}'
+        )
+    out = []
+    for entry in entries:
+        table: dict[str, Any] = {key: entry} if isinstance(entry, str) else dict(entry)
+        for name in table:
+            if name not in (key, "kwargs", "label"):
+                raise ValueError(unknown_name(f"key in suite {suite!r}:", name, (key, "kwargs", "label")))
+        if key not in table:
+            raise ValueError(f"suite {suite!r}: each table needs {key!r}, got {table}")
+        if table[key] not in every:
+            raise ValueError(unknown_name(f"{key} in suite {suite!r}:", table[key], every))
+        out.append(kind(**table))
+    return tuple(out)
+
+
+def suite_names() -> dict[str, str]:
+    """Shipped suites and what they are."""
+    files = sorted(resources.files("baselines").joinpath("suites").iterdir(), key=lambda file: file.name)
+    toml = [file for file in files if file.name.endswith(".toml")]
+    return {file.name[:-5]: str(tomllib.loads(file.read_text()).get("description", "")) for file in toml}
+
+
+def load_suite(source: str | Path | Mapping[str, Any] | Suite) -> Suite:
+    """A shipped suite by name, one from a TOML file, from a mapping, or as it is.
+
+    Raises:
+        ValueError: If it does not exist or is not valid.
+    """
+    if isinstance(source, Suite):
+        return source
+    if isinstance(source, Mapping):
+        return suite_from_dict(source)
+    path = Path(source)
+    if path.suffix == ".toml":
+        if not path.is_file():
+            raise ValueError(
+                f"there is no suite file {str(path)!r}; shipped suites: {', '.join(suite_names())}"
+            )
+        text = path.read_text()
+    elif str(source) in suite_names():
+        text = resources.files("baselines").joinpath("suites", f"{source}.toml").read_text()
+    else:
+        raise ValueError(unknown_name("suite", str(source), suite_names()) + "; or the path of a .toml file")
+    try:
+        return suite_from_dict(tomllib.loads(text), path.stem)
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"suite file {str(path)!r} is not valid TOML: {error}") from error

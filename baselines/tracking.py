@@ -1,0 +1,287 @@
+"""The controllers as policies: observation rows in, controller, actions out."""
+
+from __future__ import annotations
+
+import zlib
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from controllers.controller import Controller, Decision
+from quad_envs._numba import kernel
+from quad_envs.constraints import forces_from_actions
+from quad_envs.observations import N_REFERENCE
+from quad_envs.parameters import Array
+from quad_envs.tasks import Task
+
+from .policy import N_FALLBACKS, Actions, Counts, PolicyState
+
+_PLANT_SIZE, _N_DISTURBANCE = 16, 6
+
+
+@kernel
+def _decode(
+    obs: Actions,
+    start: NDArray[np.bool_],
+    sees_position: bool,
+    sees_disturbance: bool,
+    plants: Array,
+    windows: Array,
+    lasts: Array,
+    disturbances: Array,
+) -> int:
+    """Split observations into the arguments of a controller.
+
+    The position is the observed one, else zero: then the window is relative to the vehicle.
+
+    Args:
+        obs: (n, d) float32, see `quad_envs.observations`.
+        start: (n,) bool, rows that begin an episode.
+        sees_position: Whether the observation has `position`.
+        sees_disturbance: Whether it has `disturbance`.
+        plants: Output, (n, 16).
+        windows: Output, (n, stages, 8).
+        lasts: Output, (n, 4).
+        disturbances: Output, (n, 6).
+
+    Returns:
+        Flat index of the first entry that is not finite, or -1 - the number of rows that begin an episode.
+    """
+    n, size = obs.shape
+    stages = windows.shape[1]
+    starting = 0
+    for j in range(n):
+        row, plant, window = obs[j], plants[j], windows[j].reshape(-1)
+        bad = 0
+        for value in row:  # without a branch, so that it vectorises
+            bad |= 0 if abs(value) < np.inf else 1
+        if bad:
+            for i in range(size):
+                if not abs(row[i]) < np.inf:
+                    return int(j * size + i)
+        at = 18
+        for i in range(3):
+            plant[i] = row[at + i] if sees_position else 0.0
+            plant[3 + i] = row[i]
+            plant[9 + i] = row[7 + i]
+        plant[6], plant[7], plant[8] = row[3], row[4], np.arctan2(row[5], row[6])
+        for i in range(4):
+            plant[12 + i] = row[10 + i]
+            lasts[j, i] = row[14 + i]
+        at += 3 if sees_position else 0
+        for i in range(6):
+            disturbances[j, i] = row[at + i] if sees_disturbance else 0.0
+        at += 6 if sees_disturbance else 0
+        for i in range(window.size):
+            window[i] = row[at + i]
+        for q in range(stages):
+            for i in range(3):
+                windows[j, q, i] += plant[i]
+        starting += 1 if start[j] else 0
+    return -1 - starting
+
+
+@kernel
+def _encode(
+    commands: Array,
+    fallback: Counts,
+    iterations: Counts,
+    start: NDArray[np.bool_],
+    counts: Counts,
+    worst: Counts,
+    hover: float,
+    force_max: float,
+    actions: Actions,
+    new_counts: Counts,
+    new_worst: Counts,
+) -> None:
+    """Commands to actions, and the episode's statistics brought up to date.
+
+    Args:
+        commands: (n, 4), N.
+        fallback: (n,), how each was found.
+        iterations: (n,).
+        start: (n,) bool, rows whose statistics begin anew.
+        counts: Statistics so far, (n, 5).
+        worst: Statistics so far, (n,).
+        hover: Force of action 0, N.
+        force_max: Force of action 1, N.
+        actions: Output, (n, 4) float32.
+        new_counts: Output, (n, 5).
+        new_worst: Output, (n,).
+    """
+    for j in range(commands.shape[0]):
+        for i in range(4):
+            change = commands[j, i] - hover
+            actions[j, i] = min(max(change / (hover if change < 0.0 else force_max - hover), -1.0), 1.0)
+        for i in range(N_FALLBACKS):
+            new_counts[j, i] = 0 if start[j] else counts[j, i]
+        new_counts[j, fallback[j]] += 1
+        new_worst[j] = iterations[j] if start[j] else max(iterations[j], worst[j])
+
+
+class ControllerPolicy:
+    """A controller as a policy for tracking observations.
+
+    Args:
+        controller: The feedback law.
+        task: From which it was built.
+        name: For tables and messages.
+    """
+
+    def __init__(self, controller: Controller, task: Task, name: str) -> None:
+        self.controller, self.task, self.name = controller, task, name
+        self._size, self._stages = task.layout.size, controller.horizon + 1
+        self._hover, self._force_max = float(task.hover_force), float(task.force_max)
+        self._sees = bool(task.layout.position), bool(task.layout.disturbance)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.name!r}, {self.task.env_id!r})"
+
+    def predict(
+        self,
+        observation: NDArray[Any],
+        state: PolicyState | None = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Actions, PolicyState]:
+        """Choose actions; see `Policy`.
+
+        Raises:
+            ValueError: If a shape is wrong or an observation is not finite; it names the part.
+        """
+        obs = np.ascontiguousarray(observation, dtype=np.float32)
+        one = obs.ndim == 1
+        if one:
+            obs = obs.reshape(1, -1)
+        n = obs.shape[0]
+        if obs.ndim != 2 or obs.shape[1] != self._size:
+            shape = np.shape(observation)
+            raise ValueError(f"observation must have shape (n, {self._size}) or ({self._size},), got {shape}")
+        start = self._starts(episode_start, n)
+        if state is None:
+            state = self._fresh(n)
+        elif state.worst_iterations.shape[0] != n:
+            raise ValueError(f"state has {state.worst_iterations.shape[0]} rows, the observation {n}")
+        plants, lasts = np.empty((n, _PLANT_SIZE)), np.empty((n, 4))
+        windows, disturbances = np.empty((n, self._stages, N_REFERENCE)), np.empty((n, _N_DISTURBANCE))
+        code = _decode(obs, start, *self._sees, plants, windows, lasts, disturbances)
+        if code >= 0:
+            raise self._not_finite(obs, code)
+        memory = state.memory if code == -1 else np.where(start[:, None], 0.0, state.memory)
+        decision = self.controller.decide(plants, windows, lasts, disturbances, memory)
+        actions = np.empty((n, 4), dtype=np.float32)
+        counts, worst = np.empty((n, N_FALLBACKS), dtype=np.int64), np.empty(n, dtype=np.int64)
+        _encode(
+            decision.command,
+            decision.fallback,
+            decision.iterations,
+            start,
+            state.fallbacks,
+            state.worst_iterations,
+            self._hover,
+            self._force_max,
+            actions,
+            counts,
+            worst,
+        )
+        kept = PolicyState(decision.memory, counts, decision.iterations, worst)
+        return actions[0] if one else actions, kept
+
+    def _fresh(self, n: int) -> PolicyState:
+        """The state before an episode."""
+        count = np.zeros(n, dtype=np.int64)
+        memory = np.zeros((n, self.controller.memory_size))
+        return PolicyState(memory, np.zeros((n, N_FALLBACKS), dtype=np.int64), count, count)
+
+    @staticmethod
+    def _starts(episode_start: ArrayLike | None, n: int) -> NDArray[np.bool_]:
+        if episode_start is None:
+            return np.zeros(n, dtype=np.bool_)
+        start = np.ascontiguousarray(episode_start, dtype=np.bool_)
+        if start.shape != (n,):
+            raise ValueError(f"episode_start must have shape ({n},), one flag per row, got {start.shape}")
+        return start
+
+    def _not_finite(self, obs: Actions, index: int) -> ValueError:
+        """The error for an observation with NaN or infinity at a flat index."""
+        row, column = divmod(index, self._size)
+        slices = {name: part for name, part in self.task.layout.slices.items() if name != "own"}
+        name = next(name for name, part in slices.items() if part.start <= column < part.stop)
+        where = f"entry {column - slices[name].start} of {name!r}"
+        return ValueError(
+            f"observation {row} is not finite: {where} (index {column}) is {obs[row, column]}; "
+            "check the sensors or the wrapper that made it"
+        )
+
+
+class Hover:
+    """Hover thrust, whatever happens: the least that a policy must beat.
+
+    Args:
+        task: What is known of the flight.
+    """
+
+    horizon = 0
+    memory_size = 0
+
+    def __init__(self, task: Task) -> None:
+        self._force = float(task.hover_force)
+
+    def decide(
+        self,
+        plant: ArrayLike,
+        window: ArrayLike,
+        last_command: ArrayLike,
+        disturbance: ArrayLike,
+        memory: ArrayLike,
+    ) -> Decision:
+        """Hover commands; see `Controller.decide`."""
+        n = len(np.asarray(plant))
+        return Decision(np.full((n, 4), self._force), np.zeros((n, 0)), _zeros(n), _zeros(n))
+
+
+class Random:
+    """Uniform random actions, a pure function of seed, first observation of the episode and step.
+
+    Args:
+        task: What is known of the flight.
+        seed: Of all draws, >= 0.
+
+    Raises:
+        ValueError: If the seed is not a whole number >= 0.
+    """
+
+    horizon = 0
+    memory_size = 2  # stream of the episode, step
+
+    def __init__(self, task: Task, seed: int = 0) -> None:
+        if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+            raise ValueError(f"seed must be a whole number >= 0, got {seed!r}")
+        self._seed, self._hover, self._force_max = int(seed), float(task.hover_force), float(task.force_max)
+
+    def decide(
+        self,
+        plant: ArrayLike,
+        window: ArrayLike,
+        last_command: ArrayLike,
+        disturbance: ArrayLike,
+        memory: ArrayLike,
+    ) -> Decision:
+        """Random commands; see `Controller.decide`."""
+        plants, windows = np.asarray(plant), np.asarray(window)
+        kept: Array = np.array(memory, dtype=np.float64)
+        actions = np.empty((len(plants), 4))
+        for j, (stream, step) in enumerate(kept.tolist()):
+            if step == 0.0:
+                stream = zlib.crc32(windows[j, 0].tobytes(), zlib.crc32(plants[j].tobytes()))
+            bits = np.random.Philox(key=[self._seed, int(stream)], counter=[int(step), 0, 0, 0])
+            actions[j] = np.random.Generator(bits).uniform(-1.0, 1.0, 4)
+            kept[j] = stream, step + 1.0
+        n, command = len(plants), forces_from_actions(actions, self._hover, self._force_max)
+        return Decision(command, kept, _zeros(n), _zeros(n))
+
+
+def _zeros(n: int) -> Counts:
+    return np.zeros(n, dtype=np.int64)
