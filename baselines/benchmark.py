@@ -262,13 +262,13 @@ def _begin(folder: Path | None, suite: Suite, units: Sequence[Unit]) -> dict[int
         differing = ", ".join(key for key, value in asked.items() if before.get(key) != value)
         raise ResultsError(
             f"{str(folder)!r} holds another suite (it differs in {differing}); choose another folder, "
-            "or discard its results with fresh=True (--fresh)"
+            "or discard it with fresh=True (--fresh)"
         )
     revision = git_revision()
     if stored.get("git_revision") != revision:
         raise ResultsError(
-            f"{str(folder)!r} was begun with revision {stored.get('git_revision')} and this is {revision}: they do "
-            "not belong in one table; choose another folder, or discard its results with fresh=True (--fresh)"
+            f"{str(folder)!r} was begun with revision {stored.get('git_revision')} and this is {revision}: "
+            "they do not belong in one table; choose another folder, or discard it with fresh=True (--fresh)"
         )
     return dict(_stored_units(folder, units))
 

@@ -1,0 +1,125 @@
+"""The command line, `quad-envs` or `python -m baselines`. What a command needs is imported when it runs."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from .options import (
+    BenchmarkOptions,
+    DoctorOptions,
+    EvaluateOptions,
+    ListOptions,
+    Parser,
+    ReproduceOptions,
+    add_options,
+    read_options,
+    refuse_unknown,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+_INTERRUPTED, _BROKEN_PIPE = 130, 141  # as the shell names the signals
+
+
+class Command(NamedTuple):
+    """A subcommand."""
+
+    options: type[Any]
+    run: Callable[[Any], int]
+
+
+def _list(options: ListOptions) -> int:
+    from . import commands
+
+    return commands.list_names(options)
+
+
+def _evaluate(options: EvaluateOptions) -> int:
+    from . import commands
+
+    return commands.evaluate_one(options)
+
+
+def _benchmark(options: BenchmarkOptions) -> int:
+    from . import commands
+
+    return commands.benchmark_suite(options)
+
+
+def _reproduce(options: ReproduceOptions) -> int:
+    from . import reproduce
+
+    return int(reproduce.run(options.what, options.out, options.json, options.jobs))
+
+
+def _doctor(options: DoctorOptions) -> int:
+    from . import doctor
+
+    return doctor.examine(options.json)
+
+
+COMMANDS: dict[str, Command] = {
+    "list": Command(ListOptions, _list),
+    "evaluate": Command(EvaluateOptions, _evaluate),
+    "benchmark": Command(BenchmarkOptions, _benchmark),
+    "reproduce": Command(ReproduceOptions, _reproduce),
+    "doctor": Command(DoctorOptions, _doctor),
+}
+
+
+def make_parser() -> Parser:
+    """The parser of all commands."""
+    parser = Parser(
+        prog="quad-envs", description="Quadrotor environments with MPC baselines.", allow_abbrev=False
+    )
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for name, command in COMMANDS.items():
+        summary = str(command.options.__doc__)
+        add_options(
+            commands.add_parser(name, help=summary, description=summary, allow_abbrev=False), command.options
+        )
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; the exit code: 0, or 2 if the input was bad, 130 if interrupted."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    parser = make_parser()
+    if given and not given[0].startswith("-") and given[0] not in COMMANDS:
+        from .errors import unknown_name
+
+        parser.error(unknown_name("command", given[0], COMMANDS))
+    found, rest = parser.parse_known_args(given)
+    command = COMMANDS[found.command]
+    refuse_unknown(rest, command.options, parser)
+    with _quiet_pipe():
+        try:
+            return command.run(read_options(command.options, found))
+        except (ValueError, TypeError) as error:
+            if os.environ.get("QUAD_ENVS_TRACEBACK"):
+                raise
+            print(f"quad-envs: error: {error}", file=sys.stderr)
+            return 2
+        except KeyboardInterrupt:
+            print("quad-envs: interrupted", file=sys.stderr)
+            return _INTERRUPTED
+
+
+@contextmanager
+def _quiet_pipe() -> Iterator[None]:
+    """End without a word when the reader of a pipe, as `head`, has gone."""
+    try:
+        yield
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(_BROKEN_PIPE) from None
+
+
+if __name__ == "__main__":
+    sys.exit(main())

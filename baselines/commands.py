@@ -1,0 +1,158 @@
+"""What the commands `list`, `evaluate` and `benchmark` do."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from .errors import unknown_name
+from .options import BenchmarkOptions, EvaluateOptions, ListOptions, read_assignments
+
+
+def say(text: str) -> None:
+    """A line for the person at the terminal; results alone go to stdout."""
+    print(text, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def progress(total: int, unit: str) -> Iterator[Any]:
+    """A progress bar on a terminal, nothing in a pipe."""
+    from tqdm import tqdm
+
+    with tqdm(total=total, unit=unit, file=sys.stderr, disable=None, leave=False) as bar:
+        yield bar
+
+
+def list_names(options: ListOptions) -> int:
+    """Print what there is, or the options of one environment or policy."""
+    from quad_envs.registration import TRACKING
+
+    from .policy import TRACKING_POLICIES
+    from .suite import suite_names
+
+    if options.name:
+        return _list_options(options)
+    policies = {name: entry.description for name, entry in TRACKING_POLICIES.items()}
+    found = {"environments": TRACKING, "policies": policies, "suites": suite_names()}
+    if options.json:
+        print(json.dumps(found, indent=1))
+        return 0
+    envs = {
+        name: ", ".join(f"{key}={value!r}" for key, value in kwargs.items())
+        for name, kwargs in TRACKING.items()
+    }
+    for title, entries in (("environments", envs), ("policies", policies), ("suites", suite_names())):
+        print(title)
+        for name, text in entries.items():
+            print(f"  {name:28} {text}")
+    print("\nquad-envs list NAME shows the options of an environment or a policy")
+    return 0
+
+
+def _list_options(options: ListOptions) -> int:
+    from dataclasses import fields
+
+    from quad_envs.registration import TRACKING
+
+    from .policy import TRACKING_POLICIES, policy_options
+
+    if options.name in TRACKING:
+        from quad_envs.envs.options import TrackingOptions
+
+        values = {entry.name: entry.default for entry in fields(TrackingOptions)} | TRACKING[options.name]
+        del values["env_id"]
+        flag = "--set"
+    elif options.name in TRACKING_POLICIES:
+        values, flag = policy_options(options.name), "--policy-set"
+    else:
+        raise ValueError(unknown_name("name", options.name, [*TRACKING, *TRACKING_POLICIES]))
+    if options.json:
+        print(json.dumps(values, indent=1, default=str))
+        return 0
+    print(f"options of {options.name} and their defaults; on the command line {flag} KEY=VALUE")
+    for name, value in values.items():
+        print(f"  {name:20} {value!r}")
+    return 0
+
+
+def evaluate_one(options: EvaluateOptions) -> int:
+    """Fly one policy in one environment and print the numbers."""
+    from .benchmark import Results, run_benchmark
+    from .environments import make_env
+    from .evaluation import evaluate
+    from .policy import make_policy
+    from .suite import EnvChoice, PolicyChoice, Suite
+
+    env_kwargs = read_assignments("--set", options.set)
+    policy_kwargs = read_assignments("--policy-set", options.policy_set)
+    if options.save_episodes and options.out is None:
+        raise ValueError("--save-episodes needs a folder: --out FOLDER")
+    if options.out is not None:
+        choices = (EnvChoice(options.env, env_kwargs),), (PolicyChoice(options.policy, policy_kwargs),)
+        suite = Suite("evaluate", *choices, options.episodes, options.seed)
+        results: Results = run_benchmark(suite, options.out, save_episodes=options.save_episodes)
+        found = results.evaluations[0]
+        say(f"results in {options.out}")
+    else:
+        env = make_env(options.env, **env_kwargs)
+        policy = make_policy(options.policy, env, **policy_kwargs)
+        with progress(options.episodes, "flight") as bar:
+            count = lambda episode: bar.update()  # noqa: E731
+            found = evaluate(policy, env, options.episodes, options.seed, on_episode=count)
+    print(json.dumps(found.to_dict(), indent=1, allow_nan=False) if options.json else found)
+    return 0
+
+
+def benchmark_suite(options: BenchmarkOptions) -> int:
+    """Fly a suite, print its tables, and leave a results folder."""
+    from .benchmark import run_benchmark
+    from .suite import load_suite
+
+    suite = load_suite(options.suite)
+    changes = {
+        name: getattr(options, name) for name in ("episodes", "seed") if getattr(options, name) is not None
+    }
+    suite = replace(suite, **changes)
+    out = options.out or Path("runs") / f"{suite.name}-{datetime.now():%Y%m%d-%H%M%S}"
+    finished = 0
+    with progress(len(suite.envs) * len(suite.policies), "unit") as bar:
+
+        def on_unit(count: int, total: int) -> None:
+            nonlocal finished
+            finished = count
+            bar.update(count - bar.n)
+
+        try:
+            results = run_benchmark(
+                suite,
+                out,
+                engine=options.engine,
+                jobs=options.jobs,
+                save_episodes=options.save_episodes,
+                fresh=options.fresh,
+                on_unit=on_unit,
+            )
+        except KeyboardInterrupt:
+            bar.close()
+            say(f"interrupted; {finished} units are stored. Resume with: {_resume(options, out)}")
+            return 130
+    print(json.dumps(results.to_dict(), indent=1, allow_nan=False) if options.json else results)
+    say(f"results in {out}")
+    return 0
+
+
+def _resume(options: BenchmarkOptions, out: Path) -> str:
+    words = ["quad-envs benchmark", options.suite, f"--out {out}"]
+    for name in ("episodes", "seed"):
+        value = getattr(options, name)
+        words += [] if value is None else [f"--{name} {value}"]
+    words += [f"--engine {options.engine}"] if options.engine != "processes" else []
+    words += [f"--jobs {options.jobs}"] if options.jobs != 1 else []
+    words += ["--save-episodes"] if options.save_episodes else []
+    return " ".join(words)

@@ -1,0 +1,160 @@
+"""Options of the commands: typed dataclasses, from which argparse's arguments are made."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+from collections.abc import Sequence
+from dataclasses import MISSING, dataclass, field, fields
+from pathlib import Path
+from typing import Annotated, Any, NoReturn, TypeVar, get_args, get_type_hints
+
+from .errors import unknown_name
+
+Options = TypeVar("Options")
+
+
+class Positional(str):
+    """Help text of an argument without a flag; the help text of a flag is a plain string."""
+
+
+@dataclass(frozen=True, slots=True)
+class ListOptions:
+    """What there is: environments, policies, suites."""
+
+    name: Annotated[str, Positional("an environment id or a policy, to see its options")] = ""
+    json: Annotated[bool, "print JSON"] = False
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluateOptions:
+    """Fly one policy in one environment."""
+
+    env: Annotated[str, Positional("environment id, as quad/HelixTracking-v0")]
+    policy: Annotated[str, Positional("policy, as sdc-nmpc")]
+    episodes: Annotated[int, "number of flights"] = 20
+    seed: Annotated[int, "environment seed of the first flight"] = 0
+    set: Annotated[list[str], "keyword argument of the environment; JSON, else text"] = field(
+        default_factory=list
+    )
+    policy_set: Annotated[list[str], "option of the policy; JSON, else text"] = field(default_factory=list)
+    json: Annotated[bool, "print JSON"] = False
+    out: Annotated[Path | None, "results folder"] = None
+    save_episodes: Annotated[bool, "save every flight to the results folder"] = False
+
+
+@dataclass(frozen=True, slots=True)
+class BenchmarkOptions:
+    """Fly a suite: environments x policies, from the same starts."""
+
+    suite: Annotated[str, Positional("name of a shipped suite, or a .toml file")] = "default"
+    out: Annotated[Path | None, "results folder; runs/SUITE-DATE-TIME if not given"] = None
+    episodes: Annotated[int | None, "flights per environment and policy, instead of the suite's"] = None
+    seed: Annotated[int | None, "environment seed of the first flight, instead of the suite's"] = None
+    engine: Annotated[str, "who runs the units: processes, ray or dask"] = "processes"
+    jobs: Annotated[int, "units flown at a time; more than one disturbs decision times"] = 1
+    fresh: Annotated[bool, "discard what the folder holds of an earlier run"] = False
+    json: Annotated[bool, "print JSON"] = False
+    save_episodes: Annotated[bool, "save every flight to the results folder"] = False
+
+
+@dataclass(frozen=True, slots=True)
+class ReproduceOptions:
+    """Tables and claims of the dissertation beside our numbers."""
+
+    what: Annotated[list[str], Positional("as table-4.1, claims-4; everything if none is named")] = field(
+        default_factory=list
+    )
+    jobs: Annotated[int, "processes"] = 1
+    json: Annotated[bool, "print JSON"] = False
+    out: Annotated[Path | None, "results folder"] = None
+
+
+@dataclass(frozen=True, slots=True)
+class DoctorOptions:
+    """Look at the installation and fly a moment."""
+
+    json: Annotated[bool, "print JSON"] = False
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Exit with code 2."""
+        self.exit(2, f"{self.prog}: error: {message} (--help shows what there is)\n")
+
+
+def add_options(parser: argparse.ArgumentParser, kind: type[Any]) -> None:
+    """One argument per field."""
+    hints = get_type_hints(kind, include_extras=True)
+    for entry in fields(kind):
+        hint, text = get_args(hints[entry.name])
+        many, positional = hint == list[str], isinstance(text, Positional)
+        required = entry.default is MISSING and not many
+        settings: dict[str, Any] = {"help": str(text), "default": None}
+        if hint is bool:
+            settings["action"] = "store_true"
+        else:
+            settings["type"] = int if hint in (int, int | None) else Path if hint == (Path | None) else str
+        if not required and not many and entry.default not in (None, "", False):
+            settings["help"] += f" (default {entry.default})"
+        if positional:
+            settings["nargs"] = "*" if many else None if required else "?"
+        elif many:
+            settings |= {"action": "append", "metavar": "KEY=VALUE"}
+        elif hint is not bool:
+            settings["metavar"] = (
+                "N" if settings["type"] is int else "FOLDER" if settings["type"] is Path else "NAME"
+            )
+        parser.add_argument(entry.name if positional else _flag(entry.name), **settings)
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+def read_options(kind: type[Options], found: argparse.Namespace) -> Options:
+    """The dataclass of what was parsed."""
+    values = {entry.name: getattr(found, entry.name) for entry in fields(kind)}  # type: ignore[arg-type]
+    return kind(**{name: value for name, value in values.items() if value is not None})
+
+
+def refuse_unknown(rest: Sequence[str], kind: type[Any], parser: Parser) -> None:
+    """One clear line about arguments that no option takes."""
+    if not rest:
+        return
+    hints = get_type_hints(kind, include_extras=True)
+    known = [_flag(name) for name, hint in hints.items() if not isinstance(get_args(hint)[1], Positional)]
+    name = rest[0].split("=")[0]
+    parser.error(
+        unknown_name("option", name, known) if name.startswith("-") else f"unexpected argument {name!r}"
+    )
+
+
+def read_assignments(flag: str, texts: Sequence[str]) -> dict[str, Any]:
+    """KEY=VALUE texts as a mapping.
+
+    Raises:
+        ValueError: If one has no '=', or a key comes twice.
+    """
+    out: dict[str, Any] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals or not key:
+            raise ValueError(f"{flag} needs KEY=VALUE, as {flag} kappa=0.3125; got {text!r}")
+        if key in out:
+            raise ValueError(f"{flag} sets {key!r} twice")
+        out[key] = _value(value)
+    return out
+
+
+def _value(text: str) -> Any:
+    """JSON, else a Python literal as .5 or (1, 2), else the text itself."""
+    for read in (json.loads, ast.literal_eval):
+        try:
+            return read(text)
+        except (ValueError, SyntaxError):
+            continue
+    return text
