@@ -1,0 +1,69 @@
+"""The dissertation's tables and claims, each beside what this implementation gives."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from ..errors import unknown_name
+from .regulation_claims import REGULATION_CLAIMS
+from .results import Section
+from .tables import table_4_1, table_4_2
+from .tracking_claims import TRACKING_CLAIMS
+
+
+def claims_4(jobs: int = 1) -> Section:
+    """The claims of chapter 4 and of section 9.2."""
+    claims = [claim(jobs) for claim in (*TRACKING_CLAIMS, *REGULATION_CLAIMS)]
+    return Section("claims-4", "Claims of chapter 4 (and of section 9.2)", [], claims)
+
+
+SECTIONS: dict[str, Callable[[int], Section]] = {
+    "table-4.1": table_4_1,
+    "table-4.2": table_4_2,
+    "claims-4": claims_4,
+}
+
+
+def reproduce(what: Sequence[str] = (), jobs: int = 1) -> list[Section]:
+    """Reproduce tables and claims.
+
+    Args:
+        what: Names in SECTIONS; none, or "all", for all of them.
+        jobs: Flights in parallel. Decision times are measured one flight at a time whatever it is.
+
+    Raises:
+        ValueError: If a name is unknown.
+    """
+    for name in what:
+        if name != "all" and name not in SECTIONS:
+            raise ValueError(unknown_name("table or claims", name, [*SECTIONS, "all"]))
+    names = list(SECTIONS) if not what or "all" in what else list(dict.fromkeys(what))
+    return [SECTIONS[name](jobs) for name in names]
+
+
+def run(what: list[str], out: Path | None, as_json: bool, jobs: int) -> int:
+    """The command: print the sections, and write them to `out`/reproduce.json where given."""
+    for name in what:
+        if name != "all" and name not in SECTIONS:
+            raise ValueError(unknown_name("table or claims", name, [*SECTIONS, "all"]))
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+    names = list(SECTIONS) if not what or "all" in what else list(dict.fromkeys(what))
+    sections = []
+    for name in names:
+        section = SECTIONS[name](jobs)
+        sections.append(section)
+        if not as_json:
+            print(section, end="\n\n", flush=True)
+    text = json.dumps({"sections": [section.to_dict() for section in sections]}, indent=2)
+    if as_json:
+        sys.stdout.write(text + "\n")
+    if out is not None:
+        partial = out / ".reproduce.json.partial"
+        partial.write_text(text + "\n", encoding="utf-8")
+        os.replace(partial, out / "reproduce.json")
+    return 0

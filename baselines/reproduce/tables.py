@@ -1,0 +1,47 @@
+"""Tables 4.1 and 4.2: RMS and effort of LMPC and SDC-NMPC on three tasks at five horizons."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from quad_envs.references import Reference
+
+from .flights import DESCENDING, Flight, Outcome, fly_all
+from .published import TABLE_4_1, TABLE_4_2, Printed
+from .results import Cell, Section
+
+HORIZONS = (10, 15, 25, 35, 45)
+
+
+def table_flights(
+    controllers: Sequence[str], tasks: dict[str, Reference] = DESCENDING, jobs: int = 1
+) -> dict[tuple[str, int, str], Outcome]:
+    """(task, horizon, controller) -> flight, over all cells of the tables."""
+    keys = [(task, N, name) for task in tasks for N in HORIZONS for name in controllers]
+    flights = [Flight(name, tasks[task], horizon=N) for task, N, name in keys]
+    return dict(zip(keys, fly_all(flights, jobs), strict=True))
+
+
+def _cells(printed: Sequence[Printed], quantity: str, ours: dict[tuple[str, int, str], float]) -> list[Cell]:
+    cells = []
+    for row in printed:
+        for label, controller, value in (("LMPC", "LMPC", row.lmpc), ("NMPC", "SDC 1/2", row.nmpc)):
+            where = f"{row.task}, N = {row.horizon}, {label}"
+            cells.append(Cell(where, quantity, value, ours[row.task, row.horizon, controller]))
+    return cells
+
+
+def table_4_1(jobs: int = 1) -> Section:
+    """Average position RMS."""
+    flown = table_flights(("LMPC", "SDC 1/2"), jobs=jobs)
+    ours = {key: outcome.record.position_rms for key, outcome in flown.items()}
+    cells = _cells(TABLE_4_1, "RMS, m", ours)
+    return Section("table-4.1", "Table 4.1, average position RMS, m (NMPC with alpha = 1/2)", cells, [])
+
+
+def table_4_2(jobs: int = 1) -> Section:
+    """Average input effort."""
+    flown = table_flights(("LMPC", "SDC 1/2"), jobs=jobs)
+    ours = {key: outcome.record.effort for key, outcome in flown.items()}
+    cells = _cells(TABLE_4_2, "effort, N^2", ours)
+    return Section("table-4.2", "Table 4.2, average input effort, N^2 (NMPC with alpha = 1/2)", cells, [])
