@@ -67,7 +67,7 @@ class Outcome(NamedTuple):
 
 
 def dissertation_cost(episode: Episode) -> float:
-    """J of Eq. (3.1) without its terminal term: v_ref unrotated, yaw error not wrapped, x_k before the step."""
+    """J of Eq. (3.1) without its terminal term; v_ref unrotated, yaw error not wrapped."""
     steps = len(episode.commands)
     x, rows = episode.states[:steps, :12].copy(), episode.references[:steps]
     x[:, :6] -= rows[:, :6]
@@ -102,8 +102,8 @@ def fly_all(flights: Sequence[Flight], jobs: int = 1) -> list[Outcome]:
     return list(Parallel(n_jobs=jobs)(delayed(fly)(flight) for flight in flights))
 
 
-def regulate(controller: str, offsets: Array, horizon: int = HORIZON) -> list[tuple[Record, float]]:
-    """Regulation to the origin from many offsets (n, 3) at once: record and cost of each."""
+def regulate(controller: str, offsets: Array, horizon: int = HORIZON) -> list[Record]:
+    """Regulation to the origin from many offsets (n, 3) at once."""
     env = gymnasium.make_vec(
         "quad/Regulation-v0", num_envs=len(offsets), reference=ORIGIN, preview=horizon, start_box=0.0
     )
@@ -112,7 +112,7 @@ def regulate(controller: str, offsets: Array, horizon: int = HORIZON) -> list[tu
     name, options = CONTROLLERS[controller]
     policy = make_policy(name, env, horizon=horizon, **options)
     episodes = run_episodes(policy, _FixedStarts(env, starts), len(offsets))
-    return [(measure(episode), dissertation_cost(episode)) for episode in episodes]
+    return [measure(episode) for episode in episodes]
 
 
 class _FixedStarts(gymnasium.vector.VectorWrapper):
