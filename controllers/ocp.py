@@ -37,7 +37,7 @@ class StateRows(NamedTuple):
 
 
 class OcpQp(NamedTuple):
-    """The problem; N is the horizon. All arrays are C-contiguous float64. See the module for the equations."""
+    """The problem over a horizon N, equations in the module docstring. Arrays are C-contiguous float64."""
 
     A: Array  # (1 or N, 12, 12)
     B: Array  # (1 or N, 12, 4)
@@ -45,7 +45,7 @@ class OcpQp(NamedTuple):
     Q: Array  # (1 or N, 12, 12), stages 0..N-1
     R: Array  # (4, 4)
     Q_f: Array  # (12, 12)
-    stationary: bool  # Q_f solves the DARE of the single pair (A, B) with the single Q: one gain serves all stages
+    stationary: bool  # Q_f solves the DARE of the single (A, B) and Q: one gain serves all stages
     x_0: Array  # (12,)
     r: Array  # (N+1, 12)
     lower: Array  # (4,), N
@@ -100,7 +100,7 @@ def output_rows(normals: Array, lower: Array, upper: Array, weight: Array | floa
     for name, value in (("lower", lower), ("upper", upper), ("weight", weight)):
         column = np.asarray(value, dtype=np.float64)
         if column.shape not in ((H,), ()):
-            raise ValueError(f"{name} must have one entry per row of normals, ({H},), got shape {column.shape}")
+            raise ValueError(f"{name} must have one entry per row of normals, ({H},), got {column.shape}")
         columns.append(np.tile(np.broadcast_to(column, (H,)), horizon))
     return StateRows(
         normals=normals,
@@ -128,7 +128,7 @@ def concatenate_rows(*rows: StateRows) -> StateRows:
 
 
 def first_move_bounds(qp: OcpQp) -> tuple[Array, Array]:
-    """Bounds of the rate rows on u_0: u_last -+ rate_step, widened to the nearest face if the box moved away."""
+    """Bounds of the rate rows on u_0: u_last -+ rate_step, widened to the box if that moved away."""
     return (
         np.minimum(qp.u_last - qp.rate_step, qp.upper),
         np.maximum(qp.u_last + qp.rate_step, qp.lower),
@@ -150,7 +150,7 @@ def condense(qp: OcpQp) -> Condensed:
         S[i + 1] = qp.A[j] @ S[i]
         S[i + 1, :, N_INPUT * i : N_INPUT * (i + 1)] += qp.B[j]
         f[i + 1] = qp.A[j] @ f[i] + qp.c[i]
-    H = np.kron(np.eye(N), qp.R)
+    H = np.asarray(np.kron(np.eye(N), qp.R), dtype=np.float64)
     g = np.zeros(nv)
     for i in range(1, N + 1):
         W = qp.Q_f if i == N else qp.Q[i if len(qp.Q) > 1 else 0]
@@ -159,7 +159,9 @@ def condense(qp: OcpQp) -> Condensed:
     return Condensed(H, g, S, f)
 
 
-def _require_array(name: str, value: Array, shapes: tuple[tuple[int, ...], ...], infinite: bool = False) -> None:
+def _require_array(
+    name: str, value: Array, shapes: tuple[tuple[int, ...], ...], infinite: bool = False
+) -> None:
     """Shape, type, layout, and no NaN (nor infinity, unless that means "no limit")."""
     if not isinstance(value, np.ndarray) or value.dtype != np.float64:
         kind = value.dtype if isinstance(value, np.ndarray) else type(value).__name__
@@ -167,11 +169,12 @@ def _require_array(name: str, value: Array, shapes: tuple[tuple[int, ...], ...],
     if value.shape not in shapes:
         raise ValueError(f"{name} must have shape {' or '.join(map(str, shapes))}, got {value.shape}")
     if not value.flags.c_contiguous:
-        raise ValueError(f"{name} must be C-contiguous, got strides {value.strides}; use np.ascontiguousarray")
+        raise ValueError(f"{name} must be C-contiguous, use np.ascontiguousarray; strides {value.strides}")
     bad = np.isnan(value) if infinite else ~np.isfinite(value)
     if bad.any():
         where = tuple(int(k) for k in np.argwhere(bad)[0])
-        raise ValueError(f"{name} must be {'free of NaN' if infinite else 'finite'}, got {value[where]} at {where}")
+        allowed = "free of NaN" if infinite else "finite"
+        raise ValueError(f"{name} must be {allowed}, got {value[where]} at {where}")
 
 
 def _require_ordered(name: str, lower: Array, upper: Array) -> None:
@@ -192,7 +195,7 @@ def _require_symmetric(name: str, value: Array) -> None:
 
 def _require_indices(name: str, value: IntArray, count: int, low: int, high: int) -> None:
     if not isinstance(value, np.ndarray) or value.dtype != np.int64 or value.shape != (count,):
-        raise ValueError(f"{name} must be an int64 array of shape ({count},), one entry per row, got {value!r}")
+        raise ValueError(f"{name} must be int64 of shape ({count},), one entry per row, got {value!r}")
     if not value.flags.c_contiguous:
         raise ValueError(f"{name} must be C-contiguous, use np.ascontiguousarray")
     if count and (value.min() < low or value.max() > high):
@@ -219,9 +222,9 @@ def validate(qp: OcpQp) -> None:
     """Check everything a solver relies on, except that Q and Q_f are positive semidefinite.
 
     Raises:
-        ValueError: If a shape, type or layout is wrong, a number is not finite where it must be, bounds cross,
-            an index is out of range, a weight is not symmetric, R is not positive definite, or `stationary` is
-            claimed with more than one pair or more than one Q.
+        ValueError: If a shape, type or layout is wrong, a number is not finite where it must be, bounds
+            cross, an index is out of range, a weight is not symmetric, R is not positive definite, or
+            `stationary` is claimed with more than one pair or more than one Q.
     """
     N = len(qp.c)
     if N < 1:
@@ -243,11 +246,12 @@ def validate(qp: OcpQp) -> None:
         _require_symmetric(name, getattr(qp, name))
     smallest = float(np.linalg.eigvalsh(qp.R)[0])
     if smallest <= 0.0:
-        raise ValueError(f"R must be positive definite, its smallest eigenvalue is {smallest}; raise its diagonal")
+        raise ValueError(f"R must be positive definite, its smallest eigenvalue is {smallest}; raise it")
     if math.isnan(qp.rate_step) or qp.rate_step < 0.0:
         raise ValueError(f"rate_step must be >= 0 N per sample (inf for no limit), got {qp.rate_step}")
     if qp.stationary and (len(qp.A) > 1 or len(qp.Q) > 1):
         raise ValueError(
-            f"stationary needs one pair (A, B) and one Q, got {len(qp.A)} and {len(qp.Q)}; set stationary=False"
+            f"stationary needs one pair (A, B) and one Q, got {len(qp.A)} and {len(qp.Q)}; "
+            "set stationary=False"
         )
     _validate_rows(qp.rows, N)

@@ -24,9 +24,11 @@ _RESIDUAL_TOLERANCE = 1e-8  # of the largest entry of P; stabilisable pairs reac
 
 
 @kernel
-def _start_doubling(A: Array, B: Array, Q: Array, R: Array, A_k: Array, G: Array, H: Array, scratch: Array) -> None:
+def _start_doubling(
+    A: Array, B: Array, Q: Array, R: Array, A_k: Array, G: Array, H: Array, scratch: Array
+) -> None:
     """A_0 = A, G_0 = B R^-1 B', H_0 = Q."""
-    n, m = B.shape
+    m = B.shape[1]
     R_copy = scratch[0].reshape(-1)[: m * m].reshape(m, m)
     solved = scratch[1, :m]  # R^-1 B'
     copy(R, R_copy)
@@ -88,7 +90,7 @@ def solve_dare(A: Array, B: Array, Q: Array, R: Array, P: Array, scratch: Array)
         scratch: Overwritten, (DARE_SCRATCH, n, n).
 
     Returns:
-        The number of doublings, or -1 if they did not converge (the pair cannot be stabilised, or is not finite).
+        The number of doublings, or -1 if they did not converge: no stabilising solution, or data not finite.
     """
     A_k, G, H = scratch[7], scratch[8], scratch[9]
     _start_doubling(A, B, Q, R, A_k, G, H, scratch)
@@ -106,7 +108,7 @@ def solve_dare(A: Array, B: Array, Q: Array, R: Array, P: Array, scratch: Array)
 
 @kernel
 def _factor_inverse(S: Array, D: Array) -> None:
-    """D = L^-T for S = L L', so that D D' = S^-1; the lower triangle of S becomes L. D is upper triangular."""
+    """D = L^-T for S = L L', so that D D' = S^-1; L replaces the lower half of S, D is upper triangular."""
     m = D.shape[0]
     for a in range(m):
         for b in range(a + 1):
@@ -127,7 +129,9 @@ def _factor_inverse(S: Array, D: Array) -> None:
 
 
 @kernel
-def stage_gains(P: Array, A: Array, B: Array, R: Array, K: Array, D: Array, A_cl: Array, scratch: Array) -> None:
+def stage_gains(
+    P: Array, A: Array, B: Array, R: Array, K: Array, D: Array, A_cl: Array, scratch: Array
+) -> None:
     """The optimal feedback of one stage with cost to go x'P x / 2, and the factor of its Hessian.
 
     Args:
@@ -242,7 +246,7 @@ def riccati_pass(
 
 @kernel
 def _feed_forward(B: Array, D: Array, y: Array, k: Array, t: Array) -> None:
-    """k = -D D' B' y, the part of the optimal input that does not depend on the state."""
+    """Writes k = -D D' B' y, the part of the optimal input that does not depend on the state."""
     m = D.shape[0]
     for a in range(m):
         t[a] = 0.0
@@ -335,7 +339,7 @@ def step_plan(transposed: Array, c: Array, i: int, u: Array, x: Array) -> None:
 
 
 def _square(name: str, value: Array, n: int) -> Array:
-    """`value` as a contiguous finite (n, n) array, or a ValueError that names it."""
+    """`value` as a contiguous (n, n) array, or a ValueError that names it."""
     array = np.ascontiguousarray(value, dtype=np.float64)
     if array.shape != (n, n):
         raise ValueError(f"{name} must have shape ({n}, {n}) to match B, got {array.shape}")
@@ -369,14 +373,17 @@ def dare(A: Array, B: Array, Q: Array, R: Array) -> Array:
     for name, value in (("Q", Q), ("R", R)):
         if not np.allclose(value, value.T, rtol=1e-12, atol=1e-12 * float(np.abs(value).max())):
             raise ValueError(f"{name} must be symmetric, use ({name} + {name}.T) / 2; got {value!r}")
-    if np.linalg.eigvalsh(R)[0] <= 0.0:
-        raise ValueError(f"R must be positive definite, its smallest eigenvalue is {np.linalg.eigvalsh(R)[0]!r}")
+    smallest = float(np.linalg.eigvalsh(R)[0])
+    if smallest <= 0.0:
+        raise ValueError(f"R must be positive definite, its smallest eigenvalue is {smallest}")
     P = np.empty((n, n))
     doublings = solve_dare(A, B, Q, R, P, np.empty((DARE_SCRATCH, n, n)))
-    if doublings < 0 or _dare_residual(A, B, Q, R, P) > _RESIDUAL_TOLERANCE * max(1.0, float(np.abs(P).max())):
+    tolerance = _RESIDUAL_TOLERANCE * max(1.0, float(np.abs(P).max()))
+    if doublings < 0 or not _dare_residual(A, B, Q, R, P) <= tolerance:
+        moduli = np.abs(np.linalg.eigvals(A))
         raise ValueError(
             "the Riccati equation has no stabilising solution: every unstable or marginal mode of A must be "
-            f"controllable from B and seen by Q; eigenvalues of A have moduli {np.abs(np.linalg.eigvals(A))!r}"
+            f"controllable from B and seen by Q; the eigenvalues of A have moduli {moduli}"
         )
     return P
 
@@ -403,5 +410,5 @@ def lqr_gain(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array]:
         ValueError: As `dare`.
     """
     P = dare(A, B, Q, R)
-    K: Array = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    K = np.asarray(np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A), dtype=np.float64)
     return K, P

@@ -1,12 +1,12 @@
 """Dual active set of Goldfarb and Idnani (1983), with the multipliers of soft rows kept in [0, weight].
 
-Rows a_p'u >= b_p are numbered: 4N each of u >= lower, u <= upper, rate from below, rate from above; then the
-lower sides of the K state rows, then their upper sides. A row is inactive, working (an equality of the current
-face) or saturated: violated with its multiplier at the weight, which makes it a constant in the gradient. So an
-exact L1 penalty needs no slack variable.
+Rows a_p'u >= b_p are numbered: 4N each of u >= lower, u <= upper, rate from below, rate from above; then
+the lower sides of the K state rows, then their upper sides. A row is inactive, working (an equality of the
+current face) or saturated: violated with its multiplier at the weight, which makes it a constant in the
+gradient. So an exact L1 penalty needs no slack variable.
 
-With q working normals N_W the kernels keep J = [J_1 J_2] with J J' = H^-1, J_2'N_W = 0, and the triangular R
-with J_1'N_W = R, both stored by columns (J_T[k] is column k). A loop that starts at max(start, 0) tells the
+With q working normals N_W the kernels keep J = [J_1 J_2] with J J' = H^-1, J_2'N_W = 0, and the triangular
+R with J_1'N_W = R, both stored by columns (J_T[k] is column k). A loop that starts at max(start, 0) tells the
 compiler that no index counts from the end: only then is it vectorised.
 """
 
@@ -100,7 +100,7 @@ def _worst_state_row(
     row: int,
     worst: float,
 ) -> tuple[int, float]:
-    """As above among the state rows, where a saturated row that is satisfied counts as well; row ids from base."""
+    """As above among the state rows, where a saturated row that is satisfied counts too; ids from base."""
     K = normal.shape[0]
     for k in range(K):
         h = normal[k]
@@ -135,9 +135,11 @@ def _input_normal(p: int, nv: int, a: Array) -> tuple[int, int]:
 
 
 @kernel
-def _state_normal(h: Array, stage: int, sign: float, A: Array, B: Array, y: Array, A_y: Array, a: Array) -> int:
-    """Normal of the row sign h'x_stage in the inputs: a_i = B_i'y, y <- A_i'y backwards; returns its length."""
-    n, m = B.shape[1], B.shape[2]
+def _state_normal(
+    h: Array, stage: int, sign: float, A: Array, B: Array, y: Array, A_y: Array, a: Array
+) -> int:
+    """Normal of the row sign h'x_stage into a: a_i = B_i'y, y <- A_i'y backwards; returns its length."""
+    n, m = int(B.shape[1]), int(B.shape[2])
     for b in range(n):
         y[b] = sign * h[b]
     for i in range(stage - 1, -1, -1):
@@ -157,7 +159,7 @@ def _state_normal(h: Array, stage: int, sign: float, A: Array, B: Array, y: Arra
 
 @kernel
 def _project(J_T: Array, a: Array, start: int, stop: int, d: Array) -> float:
-    """d = J'a and |d|^2; a is zero outside start..stop. Four columns at a time, to overlap their sums."""
+    """Writes d = J'a, returns |d|^2; a is zero outside start..stop. Four columns at once, to overlap sums."""
     total = 0.0
     for k in range(0, J_T.shape[0], 4):
         s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
@@ -174,7 +176,7 @@ def _project(J_T: Array, a: Array, start: int, stop: int, d: Array) -> float:
 
 @kernel
 def _primal_direction(J_T: Array, d: Array, q: int, z: Array) -> float:
-    """z = J_2 d_2 and |d_2|^2."""
+    """Writes z = J_2 d_2, returns |d_2|^2."""
     nv = J_T.shape[0]
     zeta = 0.0
     for j in range(nv):
@@ -190,7 +192,7 @@ def _primal_direction(J_T: Array, d: Array, q: int, z: Array) -> float:
 
 @kernel
 def _solve_triangle(R_T: Array, d: Array, q: int, r: Array) -> None:
-    """r = R^-1 d_1, by columns."""
+    """Writes r = R^-1 d_1, by columns."""
     for i in range(q):
         r[i] = d[i]
     for i in range(q - 1, -1, -1):
@@ -201,10 +203,8 @@ def _solve_triangle(R_T: Array, d: Array, q: int, r: Array) -> None:
 
 
 @kernel
-def _first_to_leave(
-    nu: Array, r: Array, cap: Array, q: int
-) -> tuple[float, int, bool]:
-    """Longest step nu - t r within [0, cap]: its length, the row that stops it, and whether it stops at its cap."""
+def _first_to_leave(nu: Array, r: Array, cap: Array, q: int) -> tuple[float, int, bool]:
+    """Longest step nu - t r in [0, cap]: its length, the row that stops it, whether that is at its cap."""
     longest = math.inf
     leaving = -1
     at_cap = False
@@ -224,8 +224,8 @@ def _first_to_leave(
 def _append(J_T: Array, R_T: Array, d: Array, q: int) -> None:
     """Adds the row with d = J'a to the working set: rotations leave one entry in d_2, which extends R.
 
-    A reflection would need fewer operations but fill J; rotations of neighbours keep most of its zeros, and with
-    them those of d.
+    A reflection would need fewer operations but fill J; rotations of neighbours keep most of its zeros, and
+    with them those of d.
     """
     nv = J_T.shape[0]
     for k in range(nv - 1, q, -1):
@@ -259,7 +259,7 @@ def _remove(
     leaving: int,
     q: int,
 ) -> None:
-    """Takes working row `leaving` out of q; entry q (the row on its way in) moves to q - 1. R stays triangular."""
+    """Takes working row `leaving` out; entry q (the row on its way in) moves to q - 1. R stays triangular."""
     for j in range(leaving, q):
         active[j], sign[j], nu[j], cap[j] = active[j + 1], sign[j + 1], nu[j + 1], cap[j + 1]
     for j in range(leaving, q - 1):
@@ -333,7 +333,7 @@ def _enter(
             state[active[q]] = _WORKING
             return q + 1, iterations, OPTIMAL
         if own <= dual:
-            # Saturated and inactive exchange: a row that came from saturation has its multiplier counted down.
+            # The multiplier of a row that came from saturation is counted down from its cap.
             state[active[q]] = _SATURATED if sign[q] > 0.0 else _INACTIVE
             return q, iterations, OPTIMAL
         saturates = at_cap == (sign[leaving] > 0.0)
@@ -435,8 +435,9 @@ def dual_active_set(
         if status != OPTIMAL:
             break
         row, slack = _worst_input_row(u, lower, upper, rate_step, first_move, state)
-        if row < 0 and K > 0:
-            # Input rows first: following the states costs as much as a step.
+        if K > 0:
+            # Input rows first and state rows only when none is left would save the roll-out here, but takes
+            # twice the steps where many state rows are saturated.
             for i in range(N):
                 step_plan(transposed, c, i, u, x)
             row, slack = _worst_state_row(
@@ -491,5 +492,16 @@ def worst_row(
     if normal.shape[0] == 0:
         return row, slack
     return _worst_state_row(
-        x, normals, normal, stage, row_lower, row_upper, weight, spans, 4 * u.shape[0] * u.shape[1], state, row, slack
+        x,
+        normals,
+        normal,
+        stage,
+        row_lower,
+        row_upper,
+        weight,
+        spans,
+        4 * u.shape[0] * u.shape[1],
+        state,
+        row,
+        slack,
     )

@@ -1,12 +1,12 @@
 """OSQP behind the common interface: one persistent sparse workspace, checked at both ends.
 
-Variables z = [u_0, x_1, u_1, x_2, .., u_{N-1}, x_N, s]; s are the slacks of the soft rows. Rows: dynamics 12N,
-box 4N, rate 4N, state rows from below and from above, s >= 0. Blocks are stored full, zeros included, so that
-new data fit the pattern of the first set-up and `update` suffices.
+Variables z = [u_0, x_1, u_1, x_2, .., u_{N-1}, x_N, s]; s are the slacks of the soft rows. Rows: dynamics
+12N, box 4N, rate 4N, state rows from below and from above, s >= 0. Blocks are stored full, zeros included,
+so that new data fit the pattern of the first set-up and `update` suffices.
 
-Three facts make the checks necessary. An `update` with crossing bounds is refused with a print and the old data
-are solved. A vector of wrong length is accepted in silence. After "infeasible" the result is filled with a
-large finite number: only the status tells.
+Three facts make the checks necessary. An `update` with crossing bounds is refused with a print and the old
+data are solved. A vector of wrong length is accepted in silence. After "infeasible" the result is filled
+with a large finite number: only the status tells.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .solution import Multipliers, Solution, Status, residuals
 
 _SOLVED, _INACCURATE, _INFEASIBLE = 1, 2, (3, 4)
 _NO_BOUND = 1e30  # OSQP's infinity
-_INACCURATE_TOLERANCE = 1e-3  # residuals up to which "solved inaccurate" is accepted, 100 times the default eps
+_INACCURATE_TOLERANCE = 1e-3  # residuals up to which "solved inaccurate" is accepted
 _STAGE = N_INPUT + N_STATE
 
 
@@ -254,9 +254,7 @@ def _read(qp: OcpQp, result: Any) -> Solution:
     edges = np.cumsum([n * N, m * N, m * N, K, K])
     _, box, rate, below, above, _ = np.split(y, edges)
     box, rate = box.reshape(N, m), rate.reshape(N, m)
-    multipliers = Multipliers(
-        *(np.maximum(side, 0.0) for side in (-box, box, -rate, rate, -below, above))
-    )
+    multipliers = Multipliers(*(np.maximum(side, 0.0) for side in (-box, box, -rate, rate, -below, above)))
     solution = Solution(
         Status.OPTIMAL, stages[:, :m].copy(), np.vstack([qp.x_0, stages[:, m:]]), multipliers, iterations
     )
@@ -270,4 +268,5 @@ def _failed(qp: OcpQp, status: Status, iterations: int) -> Solution:
     N, K = len(qp.c), len(qp.rows.normal)
     inputs = [np.full((N, N_INPUT), np.nan) for _ in range(5)]
     rows = [np.full(K, np.nan) for _ in range(2)]
-    return Solution(status, inputs[0], np.full((N + 1, N_STATE), np.nan), Multipliers(*inputs[1:], *rows), iterations)
+    states = np.full((N + 1, N_STATE), np.nan)
+    return Solution(status, inputs[0], states, Multipliers(*inputs[1:], *rows), iterations)

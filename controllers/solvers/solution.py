@@ -22,7 +22,7 @@ class Status(IntEnum):
 
 
 class Multipliers(NamedTuple):
-    """Multipliers of all rows, >= 0, at most the weight on soft rows: gradient of the cost = sum of lambda a."""
+    """Multipliers of all rows, in [0, weight]: the gradient of the cost is the sum of lambda times normal."""
 
     box_lower: Array  # (N, 4), u >= lower
     box_upper: Array  # (N, 4), u <= upper
@@ -64,7 +64,8 @@ def residuals(qp: OcpQp, solution: Solution) -> Residuals:
     states = _roll_out(qp, u)
     rows = qp.rows
     slacks = _slacks(qp, u, states)
-    weights = Multipliers(*(np.full_like(u, np.inf) for _ in range(4)), rows.weight, rows.weight)
+    hard_inputs = np.full_like(u, np.inf)
+    weights = (hard_inputs,) * 4 + (rows.weight,) * 2
     pull = multipliers.row_lower - multipliers.row_upper
     gradient = _gradient(qp, u, states, pull)
     gradient -= multipliers.box_lower - multipliers.box_upper

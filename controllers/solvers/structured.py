@@ -1,9 +1,9 @@
 """The default solver: exact, structured, one compiled call, no tolerance to tune.
 
 1. A Riccati pass gives the unconstrained optimum. If it satisfies every row it is the solution.
-2. Otherwise the closed loop of the same recursion gives J with H^-1 = J J', the inverse factor of the condensed
-   Hessian: J is the impulse response from whitened inputs to inputs, so neither H nor its Cholesky factor is
-   ever formed. The dual active set (`active_set.py`) starts from there.
+2. Otherwise the closed loop of the same recursion gives J with H^-1 = J J', the inverse factor of the
+   condensed Hessian: J is the impulse response from whitened inputs to inputs, so neither H nor its Cholesky
+   factor is ever formed. The dual active set (`active_set.py`) starts from there.
 """
 
 from __future__ import annotations
@@ -91,75 +91,39 @@ def make_workspace(horizon: int, n_rows: int, n_models: int) -> Workspace:
 
 
 @kernel
-def _stationary_factor(K: Array, D: Array, A_cl: Array, B: Array, J_T: Array, wide: Array) -> None:
-    """J of one gain: block Toeplitz, so the first four columns are computed and the others copied."""
-    m, n = K.shape
-    nv = J_T.shape[0]
+def _start_column(B: Array, D: Array, J_T: Array, w: int, response: Array, column: int) -> None:
+    """The diagonal block D of J at column w, and the response B D of the next state at the given column."""
+    n, m = B.shape
     for b in range(m):
         for a in range(m):
-            J_T[b, a] = D[a, b]
+            J_T[w + b, w + a] = D[a, b]
         for a in range(n):
             total = 0.0
-            for k in range(b + 1):
+            for k in range(b + 1):  # D is upper triangular
                 total += B[a, k] * D[k, b]
-            wide[1, a, b] = total
-    for i in range(1, nv // m):
-        G, G_next = wide[i % 2], wide[1 - i % 2]  # response of x_i to the inputs of stage 0, in the first m columns
-        for b in range(m):
-            for a in range(m):
-                total = 0.0
-                for k in range(n):
-                    total += K[a, k] * G[k, b]
-                J_T[b, m * i + a] = -total
-        for a in range(n):
-            for b in range(m):
-                G_next[a, b] = 0.0
-            for k in range(n):
-                factor = A_cl[a, k]
-                for b in range(m):
-                    G_next[a, b] += factor * G[k, b]
-    for k in range(m, nv):
-        start = k - k % m
-        for j in range(nv - start):
-            J_T[k, start + j] = J_T[k % m, j]
+            response[a, column + b] = total
 
 
 @kernel
-def _marched_factor(K: Array, D: Array, A_cl: Array, B: Array, J_T: Array, wide: Array) -> None:
-    """J of N gains, marching the response X_i of x_i to all whitened inputs before stage i.
-
-    Rows i of J left of the diagonal are -K_i X_i; X_{i+1} = [A_cl_i X_i, B_i D_i].
-    """
-    N, m, n = K.shape
-    for i in range(N):
-        X, X_next = wide[i % 2], wide[1 - i % 2]
-        w = m * i
-        row = X_next[0]  # scratch until X_next is made
-        for a in range(m):
-            for k in range(w):
-                row[k] = 0.0
-            for b in range(n):
-                factor = K[i, a, b]
-                for k in range(w):
-                    row[k] -= factor * X[b, k]
-            for k in range(w):
-                J_T[k, w + a] = row[k]
-        for a in range(n):
-            for k in range(w):
-                X_next[a, k] = 0.0
-            for b in range(n):
-                factor = A_cl[i, a, b]
-                for k in range(w):
-                    X_next[a, k] += factor * X[b, k]
-        B_i = B[i if B.shape[0] > 1 else 0]
-        for b in range(m):
-            for a in range(m):
-                J_T[w + b, w + a] = D[i, a, b]
-            for a in range(n):
-                total = 0.0
-                for k in range(b + 1):
-                    total += B_i[a, k] * D[i, k, b]
-                X_next[a, w + b] = total
+def _march(K: Array, A_cl: Array, X: Array, width: int, J_T: Array, w: int, X_next: Array) -> None:
+    """One stage: rows w.. of J, -K X, below the first columns, and X_next = A_cl X, over `width` columns."""
+    row = X_next[0]  # scratch until X_next is made
+    for a in range(K.shape[0]):
+        for k in range(width):
+            row[k] = 0.0
+        for b in range(K.shape[1]):
+            factor = K[a, b]
+            for k in range(width):
+                row[k] -= factor * X[b, k]
+        for k in range(width):
+            J_T[k, w + a] = row[k]
+    for a in range(A_cl.shape[0]):
+        for k in range(width):
+            X_next[a, k] = 0.0
+        for b in range(A_cl.shape[1]):
+            factor = A_cl[a, b]
+            for k in range(width):
+                X_next[a, k] += factor * X[b, k]
 
 
 @kernel
@@ -167,6 +131,10 @@ def inverse_factor(
     K: Array, D: Array, A_cl: Array, B: Array, stationary: bool, J_T: Array, wide: Array
 ) -> None:
     """J with J J' = H^-1: J_jj = D_j, J_ij = -K_i A_cl_{i-1} .. A_cl_{j+1} B_j D_j below, 0 above.
+
+    Marches the response X_i of x_i to all whitened inputs before stage i: rows i of J left of the diagonal
+    are -K_i X_i, and X_{i+1} = [A_cl_i X_i, B_i D_i]. With one gain J is block Toeplitz: the first block
+    column is marched and the others are copies.
 
     Args:
         K: Gains, (N, 4, 12).
@@ -177,11 +145,21 @@ def inverse_factor(
         J_T: Result, J by columns, (4N, 4N).
         wide: Overwritten, (2, 12, 4N).
     """
+    N, m = D.shape[:2]
+    nv = m * N
     fill(J_T, 0.0)
+    for i in range(N):
+        X, X_next = wide[i % 2], wide[1 - i % 2]
+        g = 0 if stationary else i
+        if i > 0:
+            _march(K[g], A_cl[g], X, m if stationary else m * i, J_T, m * i, X_next)
+        if i == 0 or not stationary:
+            _start_column(B[i if B.shape[0] > 1 else 0], D[g], J_T, m * i, X_next, m * i)
     if stationary:
-        _stationary_factor(K[0], D[0], A_cl[0], B[0], J_T, wide)
-    else:
-        _marched_factor(K, D, A_cl, B, J_T, wide)
+        for k in range(m, nv):
+            start = k - k % m
+            for j in range(nv - start):
+                J_T[k, start + j] = J_T[k % m, j]
 
 
 @kernel
@@ -217,10 +195,10 @@ def solve_structured(
     iteration_limit: int,
     ws: Workspace,
 ) -> tuple[int, int]:
-    """Solve one OCP-QP; see `OcpQp` and `StateRows` for the data. Nothing is allocated and nothing is validated.
+    """Solve one OCP-QP, data as in `OcpQp` and `StateRows`. Nothing is allocated and nothing is validated.
 
-    Arrays are passed one by one because that unpacks twice as fast as a NamedTuple; call it from compiled loops
-    with one workspace per thread.
+    Arrays are passed one by one because that unpacks twice as fast as a NamedTuple. Compiled loops may call
+    it, with one workspace per thread.
 
     Args:
         A: (1 or N, 12, 12).
@@ -263,7 +241,8 @@ def solve_structured(
         ws.state[k] = 0
     riccati_pass(A, B, c, Q, R, Q_f, stationary, transposed, ws.K, ws.D, ws.A_cl, ws.P_c, ws.scratch)
     optimal_plan(B, c, Q, Q_f, x_0, r, stationary, transposed, ws.K, ws.D, ws.A_cl, ws.P_c, u, x, ws.scratch)
-    if not (_all_finite(x) and _all_finite(u) and _all_finite(r) and abs(u_last[0] + u_last[1] + u_last[2] + u_last[3]) < math.inf):
+    last = u_last[0] + u_last[1] + u_last[2] + u_last[3]
+    if not (abs(last) < math.inf and _all_finite(r) and _all_finite(u) and _all_finite(x)):
         return NOT_FINITE, 0
     first_move = ws.scratch[0, :2, :N_INPUT]
     for a in range(N_INPUT):
@@ -318,7 +297,8 @@ class StructuredSolver:
         edges = [nv, 2 * nv, 3 * nv, 4 * nv, 4 * nv + K]
         parts = np.split(ws.multipliers[: 4 * nv + 2 * K].copy(), edges)
         box_and_rate = [part.reshape(N, N_INPUT) for part in parts[:4]]
-        return Solution(Status(status), ws.u.copy(), ws.x.copy(), Multipliers(*box_and_rate, *parts[4:]), iterations)
+        multipliers = Multipliers(*box_and_rate, *parts[4:])
+        return Solution(Status(status), ws.u.copy(), ws.x.copy(), multipliers, iterations)
 
     def _fitting_workspace(self, horizon: int, n_rows: int, n_models: int) -> Workspace:
         """The kept workspace if the problem fits into it, else a larger one."""
