@@ -6,7 +6,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .benchmark import Results, run_benchmark
+    from .benchmark import run_benchmark
+    from .comparison import Results
     from .conformance import check_policy
     from .errors import PolicyCheckError, ResultsError
     from .evaluation import Evaluation, evaluate
@@ -24,7 +25,7 @@ _PUBLIC = {
     "PolicyCheckError": "errors",
     "PolicyState": "policy",
     "Record": "metrics",
-    "Results": "benchmark",
+    "Results": "comparison",
     "ResultsError": "errors",
     "Suite": "suite",
     "check_policy": "conformance",

@@ -83,7 +83,7 @@ def _list_options(options: ListOptions) -> int:
 
 def evaluate_one(options: EvaluateOptions) -> int:
     """Fly one policy in one environment and print the numbers."""
-    from .benchmark import Results, run_benchmark
+    from .benchmark import run_benchmark
     from .environments import make_env
     from .evaluation import evaluate
     from .policy import make_policy
@@ -96,7 +96,7 @@ def evaluate_one(options: EvaluateOptions) -> int:
     if options.out is not None:
         choices = (EnvChoice(options.env, env_kwargs),), (PolicyChoice(options.policy, policy_kwargs),)
         suite = Suite("evaluate", *choices, options.episodes, options.seed)
-        results: Results = run_benchmark(suite, options.out, save_episodes=options.save_episodes)
+        results = run_benchmark(suite, options.out, save_episodes=options.save_episodes)
         found = results.evaluations[0]
         say(f"results in {options.out}")
     else:

@@ -8,6 +8,8 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, TypeVar
 
+from .errors import unknown_name
+
 ENGINES = ("processes", "ray", "dask")
 _NEEDS = {
     "ray": ("ray", 'pip install "quad-envs[ray]"'),
@@ -15,6 +17,18 @@ _NEEDS = {
 }
 
 Unit = TypeVar("Unit")
+
+
+def check_engine(engine: str) -> None:
+    """Check that an engine exists and is installed.
+
+    Raises:
+        ValueError: If not; it says how to install it.
+    """
+    if engine not in ENGINES:
+        raise ValueError(unknown_name("engine", engine, ENGINES))
+    if engine in _NEEDS and find_spec(_NEEDS[engine][0]) is None:
+        raise ValueError(f"engine {engine!r} needs the package {_NEEDS[engine][0]}: {_NEEDS[engine][1]}")
 
 
 def run_units(
@@ -27,12 +41,7 @@ def run_units(
         units: Their inputs.
         engine: One of ENGINES.
         jobs: How many at a time.
-
-    Raises:
-        ValueError: If the engine is not installed; it says how to install it.
     """
-    if engine in _NEEDS and find_spec(_NEEDS[engine][0]) is None:
-        raise ValueError(f"engine {engine!r} needs the package {_NEEDS[engine][0]}: {_NEEDS[engine][1]}")
     if engine == "processes" and (jobs == 1 or len(units) < 2):
         for unit in units:
             yield _with_number(work, unit)

@@ -5,7 +5,8 @@ Episode i starts with the environment seed `seed + i`, whatever the policy: poli
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -18,8 +19,10 @@ from quad_envs.observations import N_REFERENCE
 from quad_envs.parameters import Array
 from quad_envs.tasks import Task
 
-from .policy import N_FALLBACKS, Counts, Policy, PolicyState
+from .policy import N_FALLBACKS, Actions, Counts, Policy, PolicyState
 
+_SCORES = ("stage_cost", "cost", "constraint_violation")
+_INFO = (*_SCORES, "constraint_values", "crashed")
 _WARM_UP_CALLS = 2  # the first compiles, the second takes the path with a state
 
 
@@ -45,67 +48,70 @@ class Episode(NamedTuple):
     agent: str = ""  # in a multi-agent environment
 
 
-class _Row:
-    """What one vehicle does, collected step by step."""
+class _Said(NamedTuple):
+    """What the environment said of a step, for all vehicles."""
 
-    def __init__(self, task: Task, seed: int, references: Array, agent: str = "") -> None:
-        self.task, self.seed, self.references, self.agent = task, seed, references, agent
-        self.states: list[Array] = []
-        self.actions: list[NDArray[np.floating[Any]]] = []
-        self.scores: list[tuple[float, float, float, bool, float]] = []
-        self.values: list[Array] = []
-        self.crashed = self.terminated = self.truncated = False
-        self.fallbacks, self.worst_iterations = np.zeros(N_FALLBACKS, dtype=np.int64), 0
+    rewards: NDArray[Any]  # (n,)
+    terminated: NDArray[Any]
+    truncated: NDArray[Any]
+    info: Mapping[str, NDArray[Any]]  # the keys _INFO, vehicles first
 
-    @property
-    def done(self) -> bool:
-        return self.terminated or self.truncated
 
-    def add(
-        self,
-        action: NDArray[Any],
-        reward: float,
-        info: dict[str, Any],
-        seconds: float,
-        ended: tuple[bool, bool],
+class _Recorder:
+    """What n vehicles do in one round, collected step by step as arrays over the vehicles."""
+
+    def __init__(
+        self, task: Task, seeds: Sequence[int], references: Array, agents: Sequence[str] = ()
     ) -> None:
-        """One step: what was done and what the environment said of it."""
-        self.actions.append(np.array(action))
-        self.scores.append((reward, info["stage_cost"], info["cost"], info["constraint_violation"], seconds))
-        self.values.append(info["constraint_values"])
-        self.crashed = bool(info["crashed"])
-        self.terminated, self.truncated = bool(ended[0]), bool(ended[1])
+        self.task, self.seeds, self.references = task, seeds, references
+        n = len(seeds)
+        self.agents = agents or [""] * n
+        self.live = np.ones(n, dtype=np.bool_)
+        self.lengths = np.zeros(n, dtype=np.int64)
+        self.ends = np.zeros((3, n), dtype=np.bool_)  # crashed, terminated, truncated
+        self.fallbacks, self.worst = np.zeros((n, N_FALLBACKS), dtype=np.int64), np.zeros(n, dtype=np.int64)
+        self.steps: list[tuple[NDArray[Any], Array, NDArray[Any]]] = []
+        self.seconds: list[float] = []
+        self.plants: list[Array] = []
 
-    def note(self, state: Any, j: int) -> None:
-        """Statistics of the solver, which a `PolicyState` brings along."""
+    def add(self, state: Any, actions: Actions, said: _Said, seconds: float, plants: Array) -> None:
+        """One step of all vehicles; of those that are done, nothing is kept."""
+        live, info = self.live.copy(), said.info
+        scores = np.stack([said.rewards, *(info[key] for key in _SCORES)], axis=1).astype(np.float64)
+        self.steps.append((np.array(actions), scores, info["constraint_values"]))
+        self.seconds.append(seconds)
+        self.plants.append(plants)
+        self.lengths[live] += 1
+        self.ends[:, live] = np.stack([info["crashed"], said.terminated, said.truncated])[:, live]
         if isinstance(state, PolicyState):
-            self.fallbacks = state.fallbacks[j].copy()
-            self.worst_iterations = int(state.worst_iterations[j])
+            self.fallbacks[live], self.worst[live] = state.fallbacks[live], state.worst_iterations[live]
+        self.live &= ~(self.ends[1] | self.ends[2])
 
-    def episode(self) -> Episode:
-        """The flight as arrays."""
-        steps = len(self.actions)
-        scores = np.array(self.scores, dtype=np.float64).reshape(steps, 5)
-        actions = np.array(self.actions).reshape(steps, -1)
-        return Episode(
-            task=self.task,
-            seed=self.seed,
-            states=np.array(self.states),
-            references=self.references[: steps + 1],
-            commands=forces_from_actions(actions, self.task.hover_force, self.task.force_max),
-            rewards=scores[:, 0],
-            stage_costs=scores[:, 1],
-            costs=scores[:, 2],
-            violations=scores[:, 3] > 0.0,
-            constraint_values=np.array(self.values, dtype=np.float64).reshape(steps, -1),
-            decision_times=scores[:, 4],
-            fallbacks=self.fallbacks,
-            worst_iterations=self.worst_iterations,
-            crashed=self.crashed,
-            terminated=self.terminated,
-            truncated=self.truncated,
-            agent=self.agent,
-        )
+    def episodes(self) -> Iterator[Episode]:
+        """The flights as arrays."""
+        actions, scores, values = (np.stack([step[i] for step in self.steps]) for i in range(3))
+        seconds, plants = np.array(self.seconds), np.stack(self.plants)
+        for j, steps in enumerate(self.lengths.tolist()):
+            flown = scores[:steps, j].copy()
+            yield Episode(
+                task=self.task,
+                seed=self.seeds[j],
+                states=plants[: steps + 1, j].copy(),
+                references=self.references[j, : steps + 1].copy(),
+                commands=forces_from_actions(actions[:steps, j], self.task.hover_force, self.task.force_max),
+                rewards=flown[:, 0],
+                stage_costs=flown[:, 1],
+                costs=flown[:, 2],
+                violations=flown[:, 3] > 0.0,
+                constraint_values=values[:steps, j].copy(),
+                decision_times=seconds[:steps].copy(),
+                fallbacks=self.fallbacks[j].copy(),
+                worst_iterations=int(self.worst[j]),
+                crashed=bool(self.ends[0, j]),
+                terminated=bool(self.ends[1, j]),
+                truncated=bool(self.ends[2, j]),
+                agent=self.agents[j],
+            )
 
 
 def run_episodes(policy: Policy, env: Any, episodes: int, seed: int = 0) -> Iterator[Episode]:
@@ -136,47 +142,41 @@ def _single_episodes(policy: Policy, env: Any, episodes: int, seed: int) -> Iter
     plain = env.unwrapped
     for i in range(episodes):
         observation, _ = env.reset(seed=seed + i)
-        row = _Row(plain.task, seed + i, plain.reference)
-        row.states.append(plain.state)
-        state, start = None, np.ones(1, dtype=np.bool_)
+        recorder = _Recorder(plain.task, [seed + i], plain.reference[None])
+        recorder.plants.append(plain.state[None])
         if i == 0:
             _warm_up(policy, observation[None])
-        while not row.done:
+        state, start = None, np.ones(1, dtype=np.bool_)
+        while recorder.live[0]:
             begin = perf_counter()
             actions, state = policy.predict(observation[None], state, start, deterministic=True)
             seconds = perf_counter() - begin
-            observation, reward, terminated, truncated, info = env.step(actions[0])
-            row.add(actions[0], float(reward), info, seconds, (terminated, truncated))
-            row.states.append(plain.state)
+            observation, reward, terminated, truncated, said = env.step(actions[0])
+            info = {key: np.asarray(said[key])[None] for key in _INFO}
+            told = _Said(np.array([reward]), np.array([terminated]), np.array([truncated]), info)
+            recorder.add(state, actions, told, seconds, plain.state[None])
             start = np.zeros(1, dtype=np.bool_)
-        row.note(state, 0)
-        yield row.episode()
+        yield from recorder.episodes()
 
 
 def _vector_episodes(policy: Policy, env: Any, episodes: int, seed: int) -> Iterator[Episode]:
     """Rounds of `num_envs` episodes; a row that is done waits with its last live observation."""
     plain, n = env.unwrapped, env.num_envs
     for first in range(0, episodes, n):
-        observations, _ = env.reset(seed=[seed + first + j for j in range(n)])
-        rows = [_Row(plain.task, seed + first + j, table) for j, table in enumerate(_references(plain))]
-        for row, plant in zip(rows, plain.state, strict=True):
-            row.states.append(plant)
+        seeds = [seed + first + j for j in range(n)]
+        observations, _ = env.reset(seed=seeds)
+        recorder = _Recorder(plain.task, seeds, _references(plain))
+        recorder.plants.append(plain.state)
+        wanted = min(n, episodes - first)
         state, start = None, np.ones(n, dtype=np.bool_)
-        live = np.ones(n, dtype=np.bool_)
-        while live[: episodes - first].any():
+        while recorder.live[:wanted].any():
+            live = recorder.live[:, None].copy()
             actions, state = policy.predict(observations, state, start, deterministic=True)
-            applied = np.where(live[:, None], actions, np.float32(0.0))
-            seen, rewards, terminated, truncated, info = env.step(applied)
-            plants = plain.state
-            for j in np.flatnonzero(live):
-                said = {key: value[j] for key, value in info.items() if not key.startswith("_")}
-                rows[j].add(actions[j], float(rewards[j]), said, np.nan, (terminated[j], truncated[j]))
-                rows[j].states.append(plants[j])
-                rows[j].note(state, int(j))
-            live &= ~(terminated | truncated)
-            observations = np.where(live[:, None], seen, observations)
+            seen, *told = env.step(np.where(live, actions, np.float32(0.0)))
+            recorder.add(state, actions, _Said(*told), np.nan, plain.state)
+            observations = np.where(recorder.live[:, None], seen, observations)
             start = np.zeros(n, dtype=np.bool_)
-        yield from (row.episode() for row in rows[: episodes - first])
+        yield from islice(recorder.episodes(), wanted)
 
 
 def _parallel_episodes(policy: Policy, env: Any, episodes: int, seed: int) -> Iterator[Episode]:
@@ -185,36 +185,51 @@ def _parallel_episodes(policy: Policy, env: Any, episodes: int, seed: int) -> It
     Plants and references are what the environment offers as `plants` (n, 16), `references` (n, steps, 8).
     """
     plain, names = env.unwrapped, list(env.possible_agents)
+    n = len(names)
     for i in range(episodes):
         seen, _ = env.reset(seed=seed + i)
         observations = np.stack([seen[name] for name in names])
-        tables = getattr(plain, "references", np.zeros((len(names), 0, N_REFERENCE)))
-        rows = [_Row(plain.task, seed + i, np.array(tables[j]), name) for j, name in enumerate(names)]
-        _add_plants(rows, range(len(names)), plain)
-        state, start = None, np.ones(len(names), dtype=np.bool_)
+        tables = np.array(getattr(plain, "references", np.zeros((n, 0, N_REFERENCE))))
+        recorder = _Recorder(plain.task, [seed + i] * n, tables, names)
+        recorder.plants.append(_plants(plain, n))
         if i == 0:
             _warm_up(policy, observations)
+        state, start, last = None, np.ones(n, dtype=np.bool_), None
         while env.agents:
             begin = perf_counter()
             actions, state = policy.predict(observations, state, start, deterministic=True)
-            seconds = (perf_counter() - begin) / len(names)
-            acting = [j for j, name in enumerate(names) if name in env.agents]
-            step = env.step({names[j]: actions[j] for j in acting})
-            observations = observations.copy()
-            for j in acting:
-                reward, terminated, truncated, info = (part[names[j]] for part in step[1:])
-                rows[j].add(actions[j], float(reward), info, seconds, (terminated, truncated))
-                rows[j].note(state, j)
-                observations[j] = step[0][names[j]]
-            _add_plants(rows, acting, plain)
-            start = np.zeros(len(names), dtype=np.bool_)
-        yield from (row.episode() for row in rows)
+            seconds = (perf_counter() - begin) / n
+            step = env.step({name: actions[j] for j, name in enumerate(names) if name in env.agents})
+            last = _stack_step(names, step[1:], last)
+            recorder.add(state, actions, last, seconds, _plants(plain, n))
+            rows = [step[0].get(name, row) for name, row in zip(names, observations, strict=True)]
+            observations = np.stack(rows)
+            start = np.zeros(n, dtype=np.bool_)
+        yield from recorder.episodes()
 
 
-def _add_plants(rows: list[_Row], which: Any, plain: Any) -> None:
-    plants = getattr(plain, "plants", None)
-    for j in which:
-        rows[j].states.append(np.zeros(0) if plants is None else np.array(plants[j]))
+def _stack_step(names: Sequence[str], parts: Sequence[Mapping[str, Any]], last: _Said | None) -> _Said:
+    """Rewards, ends and infos of all agents as arrays; of agents that left, what they had last."""
+    rewards, terminated, truncated, infos = parts
+    told = []
+    for j, name in enumerate(names):
+        if name in rewards:
+            info = {key: infos[name][key] for key in _INFO}
+            told.append((rewards[name], terminated[name], truncated[name], info))
+        elif last is not None:
+            info = {key: last.info[key][j] for key in _INFO}
+            told.append((last.rewards[j], last.terminated[j], last.truncated[j], info))
+        else:
+            raise ValueError(
+                f"agent {name!r} of possible_agents takes no part in the first step; all have to"
+            )
+    first, second, third, last_infos = zip(*told, strict=True)
+    info = {key: np.array([entry[key] for entry in last_infos]) for key in _INFO}
+    return _Said(np.array(first), np.array(second), np.array(third), info)
+
+
+def _plants(plain: Any, n: int) -> Array:
+    return np.array(getattr(plain, "plants", np.zeros((n, 0))), dtype=np.float64)
 
 
 def _warm_up(policy: Policy, observations: NDArray[Any]) -> None:
@@ -225,9 +240,9 @@ def _warm_up(policy: Policy, observations: NDArray[Any]) -> None:
         start = np.zeros(len(observations), dtype=np.bool_)
 
 
-def _references(plain: Any) -> list[Array]:
-    """Copies of this round's reference tables, one per row."""
+def _references(plain: Any) -> Array:
+    """Copies of this round's reference tables, (n, steps, 8)."""
     if hasattr(plain, "reference"):
-        return [np.array(table) for table in plain.reference]
+        return np.array(plain.reference)
     tables = plain._batch.references  # one for all rows where it is not random
-    return [tables[j if len(tables) > 1 else 0].copy() for j in range(plain.num_envs)]
+    return np.array(np.broadcast_to(tables, (plain.num_envs, *tables.shape[1:])))

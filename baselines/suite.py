@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from quad_envs.registration import TRACKING
 
@@ -185,3 +185,26 @@ def load_suite(source: str | Path | Mapping[str, Any] | Suite) -> Suite:
         return suite_from_dict(tomllib.loads(text), path.stem)
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"suite file {str(path)!r} is not valid TOML: {error}") from error
+
+
+class Unit(NamedTuple):
+    """What is flown in one piece."""
+
+    number: int
+    env: EnvChoice
+    policy: PolicyChoice
+    episodes: int
+    seed: int
+    episode_folder: Path | None  # where to save flights
+
+    @property
+    def file_name(self) -> str:
+        """Name of its file in cells/."""
+        slug = "".join(c if c.isalnum() else "-" for c in f"{self.env.title}--{self.policy.title}")
+        return f"{self.number:03d}-{slug[:80]}.json"
+
+
+def suite_units(suite: Suite, episode_folder: Path | None = None) -> list[Unit]:
+    """All environments x policies."""
+    pairs = [(env, policy) for env in suite.envs for policy in suite.policies]
+    return [Unit(i, *pair, suite.episodes, suite.seed, episode_folder) for i, pair in enumerate(pairs)]
