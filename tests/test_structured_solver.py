@@ -41,8 +41,8 @@ def solve_daqp(qp):
 
 def agree_with_conditions(qp, solution):
     found = residuals(qp, solution)
-    # Round-off over up to several hundred steps, relative to gradients of 1e2 to 1e4.
-    assert max(found) < 1e-8, found
+    # Three hundred times the largest seen in a thousand problems: round-off over several hundred steps.
+    assert max(found) < 1e-9, found
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -81,8 +81,8 @@ def compare_with_daqp(rng, trials, sizes):
         assert (flag == 1) == (solution.status == Status.OPTIMAL)
         statuses.add(solution.status)
         if flag == 1:
-            # DAQP is given 1e-10 on rows; a row normal of length 0.1 makes that 1e-9 in an input.
-            assert np.abs(u - solution.u).max() < 1e-8
+            # Ten times the tolerance that DAQP is given on rows.
+            assert np.abs(u - solution.u).max() < 1e-9
     return statuses
 
 

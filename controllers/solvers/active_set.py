@@ -30,7 +30,7 @@ OPTIMAL, INFEASIBLE, ITERATION_LIMIT, NOT_FINITE = range(4)  # the members of St
 ROW_TOLERANCE = 1e-9  # in the units of the row
 N_VECTORS = 7  # rows of the scratch array `vectors`
 _INACTIVE, _WORKING, _SATURATED = range(3)
-_DEPENDENT = 1e-13  # |J_2'a|^2 over |J'a|^2 below which a normal lies in the span of the working ones
+_DEPENDENT = 1e-22  # |J_2'a|^2 over |J'a|^2 below which a normal lies in the span of the working ones
 _NO_DIRECTION = 1e-13  # smallest multiplier direction that counts
 
 
