@@ -128,6 +128,34 @@ class Lemniscate:
 
 
 @dataclass(frozen=True, slots=True)
+class Racetrack:
+    """Along the walls of a box: the curve |x/a|^n + |y/b|^n = 1 at a constant rate of its angle, rising and falling.
+
+    The higher n, the sharper the corners. The reference itself touches the planes x = +-a and y = +-b.
+    """
+
+    length: float = 2.0  # m, a
+    width: float = 1.2  # m, b
+    height: float = 0.5  # m, amplitude of z at half the rate
+    rate: float = 1.2  # rad/s
+    sharpness: float = 4.0  # -, n >= 2
+    random: ClassVar[bool] = False
+
+    def rows(self, t: Array, rng: np.random.Generator) -> Array:
+        """Reference rows, (n, 8)."""
+        n, w = self.sharpness, self.rate
+        s, c = np.sin(w * t), np.cos(w * t)
+        r = (np.abs(c) ** n + np.abs(s) ** n) ** (-1.0 / n)
+        # dr/d(angle), from the derivative of r^-n
+        slope = -(r ** (n + 1)) * (np.abs(s) ** (n - 2) * s * c - np.abs(c) ** (n - 2) * c * s)
+        a, b, h = self.length, self.width, self.height
+        p = np.stack([a * r * c, b * r * s, h * np.sin(0.5 * w * t)], axis=1)
+        climb = 0.5 * h * np.cos(0.5 * w * t)
+        v = np.stack([a * (slope * c - r * s), b * (slope * s + r * c), climb], axis=1)
+        return pack_rows(p, w * v)
+
+
+@dataclass(frozen=True, slots=True)
 class RandomSmooth:
     """A sum of sines per axis with random amplitudes, rates and phases, shifted to start at the origin.
 
@@ -339,6 +367,7 @@ _BY_NAME: dict[str, Callable[[], Reference]] = {
     "spiral": SphericalSpiral,
     "lines": OutAndBack,
     "lemniscate": Lemniscate,
+    "racetrack": Racetrack,
     "random": RandomSmooth,
 }
 

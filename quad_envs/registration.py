@@ -17,6 +17,18 @@ TRACKING: dict[str, dict[str, Any]] = {
     "quad/LineTracking-v0": {"reference": "lines"},
     "quad/LemniscateTracking-v0": {"reference": "lemniscate"},
     "quad/RandomTracking-v0": {"reference": "random"},
+    # Where constraints bind: along the walls, faster than the speed limit, with weak and slow rotors, from
+    # anywhere in the box. An MPC that ignores its state rows violates them in about half of the steps.
+    "quad/CorridorTracking-v0": {
+        "reference": "racetrack",
+        "kappa": 0.3125,
+        "rate_limit": 5.0,
+        "tilt_limit": 0.35,
+        "velocity_limit": 1.8,
+        "position_limit": ((-2.0, -1.2, -1.0), (2.0, 1.2, 1.0)),
+        "start_box": (1.5, 0.8, 0.6),
+        "time_limit": 15.0,
+    },
 }
 
 

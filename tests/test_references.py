@@ -10,6 +10,7 @@ from quad_envs.references import (
     Helix,
     Lemniscate,
     OutAndBack,
+    Racetrack,
     RandomSmooth,
     SetPoint,
     SphericalSpiral,
@@ -18,7 +19,15 @@ from quad_envs.references import (
     make_reference,
 )
 
-ALL = [SetPoint((1.0, 2.0, 3.0)), Helix(), SphericalSpiral(), OutAndBack(), Lemniscate(), RandomSmooth()]
+ALL = [
+    SetPoint((1.0, 2.0, 3.0)),
+    Helix(),
+    SphericalSpiral(),
+    OutAndBack(),
+    Lemniscate(),
+    Racetrack(),
+    RandomSmooth(),
+]
 
 
 def circle(t):

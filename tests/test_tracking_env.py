@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import quad_envs
-from quad_envs.constraints import constraint_scales, constraint_values, forces_from_actions
+from quad_envs.constraints import TOLERANCE, constraint_scales, constraint_values, forces_from_actions
 from quad_envs.dynamics import derivative_reference, simulate
 from quad_envs.reward import stage_cost
 
@@ -63,7 +63,7 @@ def test_reward_and_stage_cost_are_the_readable_formulas():
         )
         cost = stage_cost(state, reference[k], command, task.hover_force, task.weights)
         values = constraint_values(state, command, previous, task.limits, task.dt)
-        hinge = np.where(values > 1e-5, values, 0.0) / constraint_scales(task.limits, task.dt)
+        hinge = np.where(values > TOLERANCE, values, 0.0) / constraint_scales(task.limits, task.dt)
         assert info["stage_cost"] == pytest.approx(cost, rel=1e-10)
         np.testing.assert_allclose(info["constraint_values"], values, atol=1e-9)
         assert info["cost"] == pytest.approx(hinge.sum(), abs=1e-7)

@@ -89,6 +89,12 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.floa
         """Copy of the plant states [p, V_B, Theta, Omega, F], (n, 16). For study and tests."""
         return self._batch.rows[:, PLANT].copy()
 
+    @property
+    def reference(self) -> Array:
+        """Copy of the reference rows of the present episodes, (n, n_steps, 8). For study and tests."""
+        tables = self._batch.references
+        return np.repeat(tables, self.num_envs, axis=0) if len(tables) == 1 else tables.copy()
+
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
