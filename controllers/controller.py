@@ -1,0 +1,135 @@
+"""What every controller offers, and the checks at its boundary."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quad_envs._numba import kernel
+from quad_envs.observations import N_REFERENCE
+from quad_envs.parameters import N_INPUT, N_STATE, Array
+
+from .disturbance import N_DISTURBANCE
+from .ocp import IntArray
+
+PLANT_SIZE = N_STATE + N_INPUT
+_NAMES = ("plant", "window", "last_command", "disturbance", "memory")
+
+
+class Decision(NamedTuple):
+    """Commands for a batch of vehicles."""
+
+    command: Array  # (n, 4), rotor commands F_cmd, N, finite and inside the box
+    memory: Array  # (n, memory_size), opaque: pass it to the next decide
+    fallback: IntArray  # (n,), Fallback: how each command was found
+    iterations: IntArray  # (n,), active-set iterations
+
+
+class Controller(Protocol):
+    """A feedback law over a batch of vehicles; rows are independent and nothing is remembered but `memory`."""
+
+    horizon: int  # stages of the reference window after the present one
+    memory_size: int  # numbers that travel from sample to sample
+
+    def decide(
+        self, plant: ArrayLike, window: ArrayLike, last_command: ArrayLike, disturbance: ArrayLike, memory: ArrayLike
+    ) -> Decision:
+        """One command per vehicle.
+
+        Args:
+            plant: Measured [p, V_B, Theta, Omega, F], (n, 16).
+            window: Reference from now on, (n, >= horizon + 1, 8): p_ref, v_ref (inertial), sin and cos of psi_ref;
+                positions in the frame of p.
+            last_command: Last applied rotor commands, (n, 4), N.
+            disturbance: Torque in body axes, N m, and force in inertial axes, N, as far as revealed, (n, 6).
+            memory: Of the previous decision, (n, memory_size); zeros for a vehicle that starts.
+
+        Returns:
+            Commands, memory and how they were found.
+
+        Raises:
+            ValueError: If a shape is wrong or a number is not finite.
+        """
+        ...
+
+
+def as_rows(
+    plant: ArrayLike,
+    window: ArrayLike,
+    last_command: ArrayLike,
+    disturbance: ArrayLike,
+    memory: ArrayLike,
+    stages: int,
+    memory_size: int,
+) -> tuple[Array, Array, Array, Array, Array]:
+    """The arguments of `decide` as contiguous float64 arrays of matching shapes.
+
+    Raises:
+        ValueError: If a shape is wrong; it says which and what is expected.
+    """
+    plants = np.ascontiguousarray(plant, dtype=np.float64)
+    windows = np.ascontiguousarray(window, dtype=np.float64)
+    lasts = np.ascontiguousarray(last_command, dtype=np.float64)
+    disturbances = np.ascontiguousarray(disturbance, dtype=np.float64)
+    memories = np.ascontiguousarray(memory, dtype=np.float64)
+    n = len(plants)
+    shape = windows.shape
+    if (
+        plants.shape != (n, PLANT_SIZE)
+        or len(shape) != 3
+        or shape[0] != n
+        or shape[1] < stages
+        or shape[2] != N_REFERENCE
+        or lasts.shape != (n, N_INPUT)
+        or disturbances.shape != (n, N_DISTURBANCE)
+        or memories.shape != (n, memory_size)
+    ):
+        wanted = (
+            f"(n, {PLANT_SIZE})",
+            f"(n, >= {stages}, {N_REFERENCE})",
+            f"(n, {N_INPUT})",
+            f"(n, {N_DISTURBANCE})",
+            f"(n, {memory_size})",
+        )
+        got = (plants.shape, shape, lasts.shape, disturbances.shape, memories.shape)
+        parts = (f"{name} {want}, got {have}" for name, want, have in zip(_NAMES, wanted, got, strict=True))
+        raise ValueError("decide needs, for n vehicles: " + "; ".join(parts))
+    return plants, windows, lasts, disturbances, memories
+
+
+@kernel
+def _finite(values: Array) -> bool:
+    """Whether all numbers are finite; without a branch, so that it vectorises."""
+    bad = 0
+    for value in values:
+        bad |= 0 if abs(value) < math.inf else 1
+    return bad == 0
+
+
+@kernel
+def first_non_finite(
+    plants: Array, windows: Array, lasts: Array, disturbances: Array, memories: Array, stages: int
+) -> int:
+    """-1 if all arguments of `decide` are finite, else 5 row + index of the argument."""
+    for j in range(plants.shape[0]):
+        if not _finite(plants[j]):
+            return 5 * j
+        if not _finite(windows[j, :stages].reshape(-1)):
+            return 5 * j + 1
+        if not _finite(lasts[j]):
+            return 5 * j + 2
+        if not _finite(disturbances[j]):
+            return 5 * j + 3
+        if not _finite(memories[j]):
+            return 5 * j + 4
+    return -1
+
+
+def raise_non_finite(code: int) -> None:
+    """Turn the result of `first_non_finite` into an error that names the argument and the row."""
+    row, argument = divmod(code, len(_NAMES))
+    remedy = "start from zeros and pass on what decide returned" if argument == 4 else "check the observation"
+    raise ValueError(f"{_NAMES[argument]} of vehicle {row} is not finite; {remedy}")

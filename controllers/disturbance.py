@@ -1,0 +1,161 @@
+"""Disturbances: what cancels them, and an estimator where they are not revealed (offset-free MPC).
+
+A disturbance is six numbers, torque in body axes (N m) and force in inertial axes (N). The rotors cancel the torques
+and the vertical force directly ("feedforward cancellation", section 4.7 of the dissertation); a lateral force needs a
+trim attitude, which becomes part of the reference.
+"""
+
+from __future__ import annotations
+
+import math
+
+from quad_envs._numba import kernel
+from quad_envs.dynamics import advance, load_vehicle, store_vehicle
+from quad_envs.parameters import (
+    GRAVITY,
+    HOVER_FORCE,
+    INV_JX,
+    INV_JY,
+    INV_JZ,
+    INV_MASS,
+    N_INPUT,
+    PITCH_GAIN,
+    ROLL_GAIN,
+    YAW_GAIN,
+    Array,
+)
+from quad_envs.rotations import sincos
+
+from .ocp import IntArray
+
+N_DISTURBANCE = 6
+PLANT_SIZE = 16
+ESTIMATOR_GAIN = 0.5  # per sample: half of what is new is noise
+ESTIMATOR_SIZE = 1 + 2 * N_DISTURBANCE + PLANT_SIZE + N_INPUT  # see `update_estimate`
+_PLANT = 1 + 2 * N_DISTURBANCE
+_COMMAND = _PLANT + PLANT_SIZE
+_SUBSTEPS = 2  # of the prediction: 3e-5 from the limit
+_SMALLEST_LIFT = 0.1  # of the weight, that the thrust carries when a force lifts the vehicle
+_YAW_SHARE = 0.5  # of the rotor force range around hover that may go into cancelling a yaw torque
+
+
+@kernel
+def feed_forward(d: Array, psi: float, c: Array, force_max: float, offset: Array, trim: Array) -> None:
+    """Rotor forces and attitude at which the vehicle stands still under a constant disturbance.
+
+    With f = d_force / m in axes turned by psi, thrust and attitude satisfy T/m R_BI'e3 = g e3 + f. The yaw torque of the
+    rotors is weak (hover allows 0.017 N m), so its part is clipped, and the rest left to the feedback.
+
+    Args:
+        d: Disturbance, (6,).
+        psi: Yaw, rad.
+        c: QuadrotorParams.coefficients().
+        force_max: Largest rotor force, N.
+        offset: Result, rotor forces in equilibrium, (4,), N: u_T without disturbance. May leave the box.
+        trim: Result, state in equilibrium, (12,): zero but for roll and pitch, rad.
+    """
+    hover = c[HOVER_FORCE]
+    offset[:] = hover
+    trim[:] = 0.0
+    if d[3] != 0.0 or d[4] != 0.0 or d[5] != 0.0:
+        sine, cosine = sincos(psi)
+        forward = c[INV_MASS] * (cosine * d[3] + sine * d[4])
+        side = c[INV_MASS] * (cosine * d[4] - sine * d[3])
+        down = max(c[GRAVITY] + c[INV_MASS] * d[5], _SMALLEST_LIFT * c[GRAVITY])
+        specific = math.sqrt(forward * forward + side * side + down * down)
+        offset[:] = hover * specific / c[GRAVITY]
+        trim[6] = -math.asin(side / specific)
+        trim[7] = math.atan(forward / down)
+    roll = 0.5 * d[0] * c[INV_JX] / c[ROLL_GAIN]
+    pitch = 0.5 * d[1] * c[INV_JY] / c[PITCH_GAIN]
+    share = _YAW_SHARE * min(hover, force_max - hover)
+    yaw = min(max(0.25 * d[2] * c[INV_JZ] / c[YAW_GAIN], -share), share)
+    offset[0] += yaw - pitch
+    offset[1] += roll - yaw
+    offset[2] += pitch + yaw
+    offset[3] -= roll + yaw
+
+
+@kernel
+def _residual(plant: Array, predicted: Array, dt: float, c: Array, out: Array) -> bool:
+    """The disturbance that explains measured minus predicted velocities, (6,); False if it is not finite."""
+    out[0] = (plant[9] - predicted[9]) / (dt * c[INV_JX])
+    out[1] = (plant[10] - predicted[10]) / (dt * c[INV_JY])
+    out[2] = (plant[11] - predicted[11]) / (dt * c[INV_JZ])
+    scale = 1.0 / (dt * c[INV_MASS])
+    u, v, w = plant[3] - predicted[3], plant[4] - predicted[4], plant[5] - predicted[5]
+    sf, cf = sincos(plant[6])
+    st, ct = sincos(plant[7])
+    ss, cs = sincos(plant[8])
+    side = cf * v - sf * w
+    under = sf * v + cf * w
+    forward = ct * u + st * under
+    out[3] = scale * (cs * forward - ss * side)
+    out[4] = scale * (ss * forward + cs * side)
+    out[5] = scale * (ct * under - st * u)
+    total = 0.0
+    for i in range(N_DISTURBANCE):
+        total += abs(out[i])
+    return total < math.inf
+
+
+@kernel
+def update_estimate(
+    plant: Array,
+    memory: Array,
+    gain: float,
+    c: Array,
+    dt: float,
+    force_max: float,
+    estimate: Array,
+    scratch: Array,
+    which: IntArray,
+) -> None:
+    """Low-passed difference between the measured plant and the one-step prediction by the full model with rotor lag.
+
+    Only velocities and rates are compared, so positions may be relative. What was revealed over the past period is
+    taken off. A difference beyond half of what the rotors could cancel is clipped: one glitch must not tumble the
+    vehicle.
+
+    Args:
+        plant: Measured [p, V_B, Theta, Omega, F], (16,).
+        memory: As `remember` left it, (ESTIMATOR_SIZE,): whether it holds a sample, the estimate, the disturbance
+            revealed then, plant and command then.
+        gain: Share of the new residual, in (0, 1].
+        c: QuadrotorParams.coefficients().
+        dt: Control period, s.
+        force_max: Largest rotor force, N.
+        estimate: Result, (6,).
+        scratch: Overwritten, (>= SCRATCH_ROWS + 22,).
+        which: Zeros, (1,).
+    """
+    for i in range(N_DISTURBANCE):
+        estimate[i] = memory[1 + i]
+    if memory[0] == 0.0:
+        return
+    predicted, measured, w = scratch[:16], scratch[16:22], scratch[22:]
+    for i in range(PLANT_SIZE):
+        predicted[i] = memory[_PLANT + i]
+    load_vehicle(w, 0, 1, predicted, memory[_COMMAND:], force_max, c, dt / _SUBSTEPS)
+    advance(w, 1, 1, _SUBSTEPS, dt / _SUBSTEPS, w[:0].reshape(1, 0, 1, N_DISTURBANCE), which, which)
+    if not (store_vehicle(w, 0, 1, predicted) and _residual(plant, predicted, dt, c, measured)):
+        return
+    weight = 4.0 * c[HOVER_FORCE]
+    arm = c[ROLL_GAIN] / c[INV_JX]
+    for i in range(N_DISTURBANCE):
+        limit = 0.5 * (arm * weight if i < 3 else weight)
+        new = min(max(measured[i] - memory[1 + N_DISTURBANCE + i], -limit), limit)
+        estimate[i] += gain * (new - estimate[i])
+
+
+@kernel
+def remember(plant: Array, command: Array, revealed: Array, estimate: Array, memory: Array) -> None:
+    """Keep what `update_estimate` needs at the next sample."""
+    memory[0] = 1.0
+    for i in range(N_DISTURBANCE):
+        memory[1 + i] = estimate[i]
+        memory[1 + N_DISTURBANCE + i] = revealed[i]
+    for i in range(PLANT_SIZE):
+        memory[_PLANT + i] = plant[i]
+    for i in range(N_INPUT):
+        memory[_COMMAND + i] = command[i]

@@ -1,0 +1,109 @@
+"""Linear MPC: the hover linearisation of chapter 3, Eqs. (3.1) to (3.14)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from quad_envs._numba import kernel
+from quad_envs.parameters import Array
+from quad_envs.tasks import Task
+
+from .controller import first_non_finite
+from .disturbance import ESTIMATOR_GAIN
+from .model import hover_pair
+from .mpc import Frame, Mpc, MpcOptions, Problem, SolverName, VelocityReference
+from .mpc_kernels import MpcData, Scratch, begin_row, carve, end_row, hold_trim, solve_row
+from .ocp import IntArray
+from .solvers.structured import ITERATION_LIMIT, Workspace
+
+
+@kernel
+def _hold_trim_everywhere(A: Array, s: Scratch) -> None:
+    """The affine terms of all stages."""
+    for i in range(s.c.shape[0]):
+        hold_trim(A[0], s.trim, s.c[i])
+
+
+@kernel
+def _decide_rows(
+    plants: Array,
+    windows: Array,
+    lasts: Array,
+    disturbances: Array,
+    memories: Array,
+    commands: Array,
+    kept: Array,
+    report: IntArray,
+    which: IntArray,
+    A: Array,
+    B: Array,
+    data: MpcData,
+    buffer: Array,
+    ws: Workspace,
+) -> int:
+    """One decision per row; -1, or the code of the first argument that is not finite."""
+    N = ws.u.shape[0]
+    bad = first_non_finite(plants, windows, lasts, disturbances, memories, N + 1)
+    if bad >= 0:
+        return bad
+    s = carve(buffer, N, 1, data.normals.shape[0], data.normal.shape[0], 0)
+    for j in range(plants.shape[0]):
+        begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
+        _hold_trim_everywhere(A, s)
+        has_plan = memories[j, 0] > 0.0
+        level, iterations = solve_row(A, B, data.Q, data.P, True, s.r, has_plan, data, s, ws)
+        end_row(level, plants[j], lasts[j], disturbances[j], memories[j], data, s, ws.u, commands[j], kept[j])
+        report[0, j], report[1, j] = level, iterations
+    return bad
+
+
+class LinearMPC(Mpc):
+    """MPC on the hover linearisation, with the solution of its Riccati equation as terminal weight.
+
+    Deviation:
+        With frame "heading" (default) the problem is posed at the present position and heading, so that yaw may be
+        anything; "hover" is the dissertation's: the model belongs to psi = 0, v_ref stands in the slot of V_B in
+        inertial axes, and the yaw error is not wrapped.
+
+    Args:
+        task: What is known of the flight.
+        horizon: N, samples.
+        solver: "structured" (exact, one compiled call) or "osqp".
+        frame: "heading" or "hover".
+        velocity_reference: Axes in which v_ref is compared with V_B: "heading", or "attitude" for the present body axes.
+        soft_weight: Exact penalty per unit of a state row; inf makes the rows hard.
+        reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
+        estimator_gain: Share of each new residual in the estimate, in (0, 1].
+        iteration_limit: Largest number of active-set steps of a solve.
+
+    Raises:
+        ValueError: If an option is not allowed.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        horizon: int = 25,
+        *,
+        solver: SolverName = "structured",
+        frame: Frame = "heading",
+        velocity_reference: VelocityReference = "heading",
+        soft_weight: float = 1e3,
+        reject_disturbance: bool = False,
+        estimator_gain: float = ESTIMATOR_GAIN,
+        iteration_limit: int = ITERATION_LIMIT,
+    ) -> None:
+        options = MpcOptions(
+            solver, frame, velocity_reference, soft_weight, reject_disturbance, estimator_gain, iteration_limit
+        )
+        super().__init__(task, horizon, options, pairs=1, guess=False)
+        A, B = hover_pair(task.params, task.dt)
+        self._A, self._B = np.ascontiguousarray(A[None]), np.ascontiguousarray(B[None])
+
+    def _decide_rows(self, *arrays: Array) -> int:
+        which, buffer, ws = self._scratch()
+        return _decide_rows(*arrays, which, self._A, self._B, self._data, buffer, ws)
+
+    def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
+        _hold_trim_everywhere(self._A, s)
+        return Problem(self._A, self._B, self._data.Q, self._data.P, True, s.r)

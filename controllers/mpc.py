@@ -1,0 +1,247 @@
+"""What all MPCs share in Python: options and their checks, memory, and the batched decision."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, VELOCITY, Array, Limits
+from quad_envs.tasks import Task
+
+from .controller import Decision, as_rows, first_non_finite, raise_non_finite
+from .disturbance import ESTIMATOR_SIZE
+from .fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXED_WEIGHT
+from .model import hover_pair
+from .mpc_kernels import MpcData, Scratch, begin_row, buffer_size, carve, end_row
+from .ocp import IntArray, OcpQp, StateRows, no_rows, output_rows
+from .riccati import dare
+from .solvers import Backend, Status, StructuredSolver
+from .solvers.structured import Workspace, make_workspace
+
+SolverName = Literal["structured", "osqp"]
+Frame = Literal["heading", "hover"]
+VelocityReference = Literal["heading", "attitude"]
+
+
+def require_choice(name: str, value: object, kind: Any) -> None:
+    """Check that `value` is one of the strings of a Literal type.
+
+    Raises:
+        ValueError: If it is not; names what is allowed.
+    """
+    if value not in get_args(kind):
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, get_args(kind)))}, got {value!r}")
+
+
+@dataclass(frozen=True, slots=True)
+class MpcOptions:
+    """Options that every MPC takes; `LinearMPC` explains them.
+
+    Raises:
+        ValueError: If one is not allowed.
+    """
+
+    solver: SolverName
+    frame: Frame
+    velocity_reference: VelocityReference
+    soft_weight: float
+    reject_disturbance: bool
+    estimator_gain: float
+    iteration_limit: int
+
+    def __post_init__(self) -> None:
+        require_choice("solver", self.solver, SolverName)
+        require_choice("frame", self.frame, Frame)
+        require_choice("velocity_reference", self.velocity_reference, VelocityReference)
+        if not self.soft_weight >= 0.0:
+            raise ValueError(f"soft_weight must be >= 0 (math.inf for hard rows), got {self.soft_weight!r}")
+        if not 0.0 < self.estimator_gain <= 1.0:
+            raise ValueError(f"estimator_gain must lie in (0, 1], got {self.estimator_gain!r}")
+        if self.iteration_limit < 1:
+            raise ValueError(f"iteration_limit must be at least 1, got {self.iteration_limit!r}")
+
+
+class Problem(NamedTuple):
+    """What a flavour contributes to the OCP-QP of one sample."""
+
+    A: Array  # (1 or N, 12, 12)
+    B: Array  # (1 or N, 12, 4)
+    Q: Array  # (1 or N, 12, 12)
+    Q_f: Array  # (12, 12)
+    stationary: bool
+    r: Array  # (N+1, 12)
+
+
+def limit_rows(limits: Limits, weight: float, horizon: int) -> tuple[StateRows, IntArray]:
+    """State rows of the finite limits at stages 1..N, and the position axis of each output (-1: none).
+
+    Outputs: body velocity components, roll and pitch, coordinates of the position, in this order.
+    """
+    lower, upper = np.full(N_STATE, -math.inf), np.full(N_STATE, math.inf)
+    lower[VELOCITY], upper[VELOCITY] = -limits.velocity, limits.velocity
+    lower[ATTITUDE][:2], upper[ATTITUDE][:2] = -limits.tilt, limits.tilt
+    lower[POSITION], upper[POSITION] = limits.position_lower, limits.position_upper
+    order = np.r_[VELOCITY, ATTITUDE, POSITION]
+    outputs = order[np.isfinite(lower[order]) | np.isfinite(upper[order])]
+    rows = output_rows(np.eye(N_STATE)[outputs], lower[outputs], upper[outputs], weight, horizon)
+    return rows, np.where(outputs < POSITION.stop, outputs, -1).astype(np.int64)
+
+
+def _mpc_data(task: Task, horizon: int, options: MpcOptions) -> MpcData:
+    """The constants of a controller."""
+    params, Q, R = task.params, task.weights.Q_matrix(), task.weights.R_matrix()
+    if options.frame == "heading" and Q[0, 0] != Q[1, 1]:
+        raise ValueError(
+            f"frame 'heading' needs equal weights on x and y, got {Q[0, 0]} and {Q[1, 1]}; use frame='hover'"
+        )
+    A, B = hover_pair(params, task.dt)
+    rows, axis = limit_rows(task.limits, options.soft_weight, horizon)
+    return MpcData(
+        coefficients=params.coefficients(),
+        B_c=params.input_matrix(),
+        Q=np.ascontiguousarray(Q[None]),
+        R=R,
+        P=dare(A, B, Q, R),
+        normals=rows.normals,
+        axis=axis,
+        normal=rows.normal,
+        stage=rows.stage,
+        lower=rows.lower,
+        upper=rows.upper,
+        weight=rows.weight,
+        dt=float(task.dt),
+        force_max=float(task.force_max),
+        rate_step=float(task.limits.rate * task.dt),
+        gain=float(options.estimator_gain) if options.reject_disturbance else 0.0,
+        heading=options.frame == "heading",
+        attitude=options.velocity_reference == "attitude",
+        iteration_limit=int(options.iteration_limit),
+    )
+
+
+class Mpc(ABC):
+    """A flavour of MPC: makes the pairs of the OCP-QP, and inherits the rest.
+
+    Not for use by several threads at once: the scratch memory is shared.
+    """
+
+    def __init__(self, task: Task, horizon: int, options: MpcOptions, *, pairs: int, guess: bool) -> None:
+        if horizon != int(horizon) or horizon < 1:
+            raise ValueError(f"horizon must be a whole number of samples >= 1, got {horizon!r}")
+        self.task = task
+        self.horizon = int(horizon)
+        self.options = options
+        self._data = _mpc_data(task, self.horizon, options)
+        self._pairs = pairs
+        self._guess_stages = self.horizon if guess else 0
+        self._keep_from = 1 + N_INPUT * self.horizon + (ESTIMATOR_SIZE if options.reject_disturbance else 0)
+        self.memory_size = self._keep_from + (1 + N_STATE * (self.horizon + 1) if guess else 0)
+        self._workspace: tuple[IntArray, Array, Workspace] | None = None
+        self._backend: Backend | None = None
+
+    def decide(
+        self, plant: ArrayLike, window: ArrayLike, last_command: ArrayLike, disturbance: ArrayLike, memory: ArrayLike
+    ) -> Decision:
+        """One command per vehicle; see `Controller.decide`."""
+        arrays = as_rows(plant, window, last_command, disturbance, memory, self.horizon + 1, self.memory_size)
+        n = arrays[0].shape[0]
+        command, kept, report = np.empty((n, N_INPUT)), np.empty((n, self.memory_size)), np.empty((2, n), np.int64)
+        if self.options.solver == "structured":
+            bad = self._decide_rows(*arrays, command, kept, report)
+        else:
+            bad = self._decide_by_backend(*arrays, command, kept, report)
+        if bad >= 0:
+            raise_non_finite(bad)
+        return Decision(command, kept, report[0], report[1])
+
+    @abstractmethod
+    def _decide_rows(self, *arrays: Any) -> int:
+        """The whole batch in one compiled call."""
+
+    @abstractmethod
+    def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
+        """The problem of one pass, given the plan of the pass before in ws."""
+
+    def _accept(self, number: int, s: Scratch, ws: Workspace) -> bool:
+        """Take the plan in ws after pass `number`; whether it is the last one."""
+        return True
+
+    def _keep(self, level: int, kept: Array, s: Scratch) -> None:
+        """Write what the flavour remembers."""
+
+    def _scratch(self) -> tuple[IntArray, Array, Workspace]:
+        """Zeros for a kernel, the flat buffer, and the solver's memory; made at the first decision."""
+        if self._workspace is None:
+            self._workspace = (
+                np.zeros(1, np.int64),
+                np.zeros(buffer_size(self.horizon, *self._sizes())),
+                make_workspace(self.horizon, len(self._data.normal), self._pairs),
+            )
+        return self._workspace
+
+    def _sizes(self) -> tuple[int, int, int, int]:
+        """Pairs, outputs, rows, stages of the guess."""
+        return self._pairs, len(self._data.normals), len(self._data.normal), self._guess_stages
+
+    def _decide_by_backend(self, *arrays: Any) -> int:
+        """The same kernels row by row, with a solver behind the common interface."""
+        plants, windows, lasts, disturbances, memories, commands, kept, report = arrays
+        bad = first_non_finite(plants, windows, lasts, disturbances, memories, self.horizon + 1)
+        if bad >= 0:
+            return bad
+        which, buffer, ws = self._scratch()
+        s = carve(buffer, self.horizon, *self._sizes())
+        for j in range(len(plants)):
+            row = plants[j], windows[j], lasts[j], disturbances[j], memories[j]
+            begin_row(*row, which, self._data, s)
+            level, iterations, number, done = NONE, 0, 0, False
+            while not done:
+                problem = self._pose(number, memories[j], s, ws)
+                level, count = self._solve(problem, bool(memories[j, 0] > 0.0), level, s, ws)
+                iterations += count
+                done = level > RELAXED or self._accept(number, s, ws)
+                number += 1
+            end_row(level, plants[j], lasts[j], disturbances[j], memories[j], self._data, s, ws.u, commands[j], kept[j])
+            self._keep(level, kept[j], s)
+            report[:, j] = level, iterations
+        return -1
+
+    def _solve(
+        self, problem: Problem, has_plan: bool, level: int, s: Scratch, ws: Workspace
+    ) -> tuple[int, int]:
+        """The fallback order of `solve_row` with any backend."""
+        if self._backend is None:
+            from .solvers.osqp import OsqpSolver
+
+            self._backend = OsqpSolver()
+        rows = StateRows(s.normals, self._data.normal, self._data.stage, s.row_lower, s.row_upper, s.weight)
+        qp = OcpQp(
+            *problem[:2], s.c, problem.Q, self._data.R, *problem[3:5], s.x_0, problem.r, s.lower, s.upper,
+            self._data.rate_step, s.u_last, rows,
+        )  # fmt: skip
+        solution = self._backend.solve(qp)
+        iterations = solution.iterations
+        if solution.status == Status.INFEASIBLE and level == NONE:
+            np.minimum(s.weight, RELAXED_WEIGHT, out=s.weight)
+            level = RELAXED
+            solution = self._backend.solve(qp)
+            iterations += solution.iterations
+        if solution.status != Status.OPTIMAL and has_plan:
+            return PREVIOUS_PLAN, iterations
+        if solution.status != Status.OPTIMAL:
+            level = CLIPPED_SDRE
+            s.lower[:], s.upper[:] = -math.inf, math.inf
+            solution = StructuredSolver().solve(qp._replace(rate_step=math.inf, rows=no_rows()))
+        if solution.status != Status.OPTIMAL:
+            return HOVER, iterations
+        ws.u[:], ws.x[:] = solution.u, solution.x
+        return level, iterations
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but scratch memory and the backend's, which are made again when needed."""
+        return {**self.__dict__, "_workspace": None, "_backend": None}

@@ -1,0 +1,331 @@
+"""One sample of an MPC in compiled form: frame, reference, bounds and rows before the solve, fallbacks, command after it.
+
+The flavours (`lmpc.py`, `sdc_nmpc.py`, `nmpc.py`) add how the pairs (A_i, B_i) and affine terms c_i are made.
+
+Memory of one vehicle: whether a plan is held, the plan's rotor commands (N x 4), then, with `reject_disturbance`, the
+estimator's ESTIMATOR_SIZE numbers, then what the flavour keeps.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from quad_envs._numba import kernel
+from quad_envs.dynamics import SCRATCH_ROWS
+from quad_envs.parameters import HOVER_FORCE, N_INPUT, N_STATE, Array
+from quad_envs.rotations import sincos, wrap_angle_scalar
+
+from .disturbance import N_DISTURBANCE, feed_forward, remember, update_estimate
+from .fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXED_WEIGHT, limit_command
+from .ocp import IntArray
+from .riccati import DARE_SCRATCH
+from .solvers.active_set import INFEASIBLE, OPTIMAL
+from .solvers.structured import Workspace, solve_structured
+
+_WORK = 22 + SCRATCH_ROWS  # of `update_estimate`
+
+
+class MpcData(NamedTuple):
+    """Constants of one controller, for compiled code."""
+
+    coefficients: Array  # (N_COEFFICIENTS,)
+    B_c: Array  # (12, 4)
+    Q: Array  # (1, 12, 12)
+    R: Array  # (4, 4)
+    P: Array  # (12, 12), weight of x_N: solves the Riccati equation of the hover pair
+    normals: Array  # (H, 12), outputs with limits
+    axis: IntArray  # (H,), 0..2 where the output is that coordinate of the position, else -1
+    normal: IntArray  # (K,)
+    stage: IntArray  # (K,)
+    lower: Array  # (K,)
+    upper: Array  # (K,)
+    weight: Array  # (K,)
+    dt: float
+    force_max: float
+    rate_step: float
+    gain: float  # of the disturbance estimator, 0 for none
+    heading: bool  # whether the problem is posed at the present position and heading
+    attitude: bool  # whether v_ref is turned into the present body axes
+    iteration_limit: int
+
+
+class Scratch(NamedTuple):
+    """One sample's problem and the memory to make it, carved from one flat buffer."""
+
+    x_0: Array  # (12,)
+    trim: Array  # (12,), equilibrium under the disturbance
+    offset: Array  # (4,), equilibrium rotor forces; u = F - offset
+    lower: Array  # (4,), of u
+    upper: Array  # (4,)
+    u_last: Array  # (4,)
+    d: Array  # (6,), disturbance in the axes of the problem
+    estimate: Array  # (6,), of what is not revealed
+    r: Array  # (N+1, 12)
+    c: Array  # (N, 12)
+    A: Array  # (1 or N, 12, 12)
+    B: Array  # (1 or N, 12, 4)
+    normals: Array  # (H, 12)
+    row_lower: Array  # (K,)
+    row_upper: Array  # (K,)
+    weight: Array  # (K,)
+    A_c: Array  # (12, 12)
+    P: Array  # (12, 12)
+    square: Array  # (DARE_SCRATCH, 12, 12)
+    work: Array  # (_WORK,)
+    Q: Array  # (M, 12, 12), stage weights; M = N where a guess is kept, else 0
+    target: Array  # (M+1, 12), references that go with them
+    X: Array  # (M+1, 12), guess of the states
+    F: Array  # (M, 4), and of the rotor forces
+
+
+def buffer_size(N: int, pairs: int, H: int, K: int, M: int) -> int:
+    """Numbers that `carve` needs."""
+    n, m = N_STATE, N_INPUT
+    vectors = 2 * n + 4 * m + 2 * N_DISTURBANCE + _WORK
+    stages = n * (2 * N + 1) + pairs * n * (n + m) + n * H + 3 * K
+    return vectors + stages + (2 + DARE_SCRATCH) * n * n + M * n * n + 2 * n * (M + 1) + m * M
+
+
+@kernel
+def _take(buffer: Array, start: int, rows: int, columns: int) -> Array:
+    """The next matrix of the buffer."""
+    return buffer[start : start + rows * columns].reshape(rows, columns)
+
+
+@kernel
+def carve(buffer: Array, N: int, pairs: int, H: int, K: int, M: int) -> Scratch:
+    """Views of the buffer; one array is unpacked at the call from Python instead of two dozen."""
+    n, m, e = N_STATE, N_INPUT, N_DISTURBANCE
+    v = _take(buffer, 0, 1, 2 * n + 4 * m + 2 * e + _WORK)[0]
+    i = v.shape[0]
+    r = _take(buffer, i, N + 1, n)
+    i += r.size
+    c = _take(buffer, i, N, n)
+    i += c.size
+    A = _take(buffer, i, pairs * n, n).reshape(pairs, n, n)
+    i += A.size
+    B = _take(buffer, i, pairs * n, m).reshape(pairs, n, m)
+    i += B.size
+    square = _take(buffer, i, (2 + DARE_SCRATCH) * n, n).reshape(2 + DARE_SCRATCH, n, n)
+    i += square.size
+    normals = _take(buffer, i, H, n)
+    i += normals.size
+    rows = _take(buffer, i, 3, K)
+    i += rows.size
+    Q = _take(buffer, i, M * n, n).reshape(M, n, n)
+    i += Q.size
+    target = _take(buffer, i, M + 1, n)
+    i += target.size
+    X = _take(buffer, i, M + 1, n)
+    F = _take(buffer, i + X.size, M, m)
+    o = 2 * n + 4 * m
+    return Scratch(
+        v[:n], v[n : 2 * n], v[2 * n : 2 * n + m], v[2 * n + m : 2 * n + 2 * m],
+        v[2 * n + 2 * m : 2 * n + 3 * m], v[2 * n + 3 * m : o], v[o : o + e], v[o + e : o + 2 * e],
+        r, c, A, B, normals, rows[0], rows[1], rows[2], square[0], square[1], square[2:], v[o + 2 * e :],
+        Q, target, X, F,
+    )  # fmt: skip
+
+
+@kernel
+def set_state(plant: Array, heading: bool, x_0: Array) -> None:
+    """The measured state in the frame of the problem: with `heading`, p = 0 and psi = 0."""
+    for i in range(N_STATE):
+        x_0[i] = plant[i]
+    if heading:
+        x_0[0], x_0[1], x_0[2], x_0[8] = 0.0, 0.0, 0.0, 0.0
+
+
+@kernel
+def set_references(
+    plant: Array, window: Array, trim: Array, heading: bool, attitude: bool, r: Array
+) -> None:
+    """Rows r_i = [p_ref; v_ref; trim phi, theta; psi_ref; 0] in the frame of the problem.
+
+    The slot of V_B holds v_ref turned by the present heading, or by the whole present attitude, or (frame "hover",
+    as in the dissertation) as it stands in inertial axes. psi_ref goes on continuously from row to row; the first
+    is the one nearest to psi with `heading`, and in (-pi, pi] without.
+
+    Args:
+        plant: Measured, (16,).
+        window: (>= stages, 8).
+        trim: Attitude in equilibrium, (12,).
+        heading: Whether the frame is turned and shifted to the vehicle.
+        attitude: Whether v_ref is turned into the present body axes.
+        r: Result, (stages, 12).
+    """
+    psi = plant[8]
+    sine, cosine = sincos(psi if heading else 0.0)
+    sf, cf, st, ct = 0.0, 1.0, 0.0, 1.0
+    sv, cv = sine, cosine
+    if attitude:
+        sf, cf = sincos(plant[6])
+        st, ct = sincos(plant[7])
+        sv, cv = sincos(psi)
+    yaw = 0.0
+    for i in range(r.shape[0]):
+        if i == 0:
+            yaw = math.atan2(window[0, 6], window[0, 7])
+            if heading:
+                yaw = wrap_angle_scalar(yaw - psi)
+        elif window[i, 6] != window[i - 1, 6] or window[i, 7] != window[i - 1, 7]:
+            turn_sine = window[i, 6] * window[i - 1, 7] - window[i, 7] * window[i - 1, 6]
+            turn_cosine = window[i, 7] * window[i - 1, 7] + window[i, 6] * window[i - 1, 6]
+            yaw = yaw + math.atan2(turn_sine, turn_cosine) if heading else math.atan2(window[i, 6], window[i, 7])
+        x, y, z = window[i, 0], window[i, 1], window[i, 2]
+        if heading:
+            x, y, z = x - plant[0], y - plant[1], z - plant[2]
+        u = cv * window[i, 3] + sv * window[i, 4]
+        v = cv * window[i, 4] - sv * window[i, 3]
+        w = window[i, 5]
+        down = st * u + ct * w
+        r[i, 0], r[i, 1], r[i, 2] = cosine * x + sine * y, cosine * y - sine * x, z
+        r[i, 3], r[i, 4], r[i, 5] = ct * u - st * w, sf * down + cf * v, cf * down - sf * v
+        r[i, 6], r[i, 7], r[i, 8] = trim[6], trim[7], trim[8] + yaw
+        r[i, 9], r[i, 10], r[i, 11] = 0.0, 0.0, 0.0
+
+
+@kernel
+def set_rows(plant: Array, data: MpcData, s: Scratch) -> None:
+    """Limits on outputs; those on the position are turned and shifted with the frame."""
+    for h in range(data.normals.shape[0]):
+        for a in range(N_STATE):
+            s.normals[h, a] = data.normals[h, a]
+    for k in range(data.normal.shape[0]):
+        s.row_lower[k], s.row_upper[k], s.weight[k] = data.lower[k], data.upper[k], data.weight[k]
+    if not data.heading:
+        return
+    sine, cosine = sincos(plant[8])
+    for h in range(data.normals.shape[0]):
+        if data.axis[h] == 0:
+            s.normals[h, 0], s.normals[h, 1] = cosine, -sine
+        elif data.axis[h] == 1:
+            s.normals[h, 0], s.normals[h, 1] = sine, cosine
+    for k in range(data.normal.shape[0]):
+        axis = data.axis[data.normal[k]]
+        if axis >= 0:
+            s.row_lower[k] -= plant[axis]
+            s.row_upper[k] -= plant[axis]
+
+
+@kernel
+def begin_row(
+    plant: Array, window: Array, last: Array, revealed: Array, memory: Array, which: IntArray, data: MpcData, s: Scratch
+) -> None:
+    """Everything of one sample's problem but the model: disturbance, equilibrium, state, reference, bounds, rows."""
+    s.estimate[:] = 0.0
+    if data.gain > 0.0:
+        kept = memory[1 + N_INPUT * s.c.shape[0] :]
+        update_estimate(
+            plant, kept, data.gain, data.coefficients, data.dt, data.force_max, s.estimate, s.work, which
+        )
+    for i in range(N_DISTURBANCE):
+        s.d[i] = revealed[i] + s.estimate[i]
+    feed_forward(s.d, plant[8], data.coefficients, data.force_max, s.offset, s.trim)
+    if data.heading:
+        sine, cosine = sincos(plant[8])
+        s.d[3], s.d[4] = cosine * s.d[3] + sine * s.d[4], cosine * s.d[4] - sine * s.d[3]
+    set_state(plant, data.heading, s.x_0)
+    set_references(plant, window, s.trim, data.heading, data.attitude, s.r)
+    for a in range(N_INPUT):
+        s.lower[a] = -s.offset[a]
+        s.upper[a] = data.force_max - s.offset[a]
+        s.u_last[a] = last[a] - s.offset[a]
+    set_rows(plant, data, s)
+
+
+@kernel
+def hold_trim(A: Array, trim: Array, c: Array) -> None:
+    """C = trim - A trim: the equilibrium stays one in the model; zero without a lateral force."""
+    for i in range(N_STATE):
+        c[i] = trim[i] - A[i, 6] * trim[6] - A[i, 7] * trim[7]
+
+
+@kernel
+def _widen(s: Scratch) -> None:
+    """No bounds on the inputs."""
+    for a in range(N_INPUT):
+        s.lower[a] = -math.inf
+        s.upper[a] = math.inf
+
+
+@kernel
+def solve_row(
+    A: Array,
+    B: Array,
+    Q: Array,
+    Q_f: Array,
+    stationary: bool,
+    r: Array,
+    has_plan: bool,
+    data: MpcData,
+    s: Scratch,
+    ws: Workspace,
+) -> tuple[int, int]:
+    """Solve with fallbacks: hard rows that contradict each other become soft; without a plan, no constraints at all.
+
+    Returns:
+        Fallback (PREVIOUS_PLAN and HOVER leave no plan in ws.u), and active-set iterations.
+    """
+    level = NONE
+    iterations = 0
+    rate_step = data.rate_step
+    K = data.normal.shape[0]
+    while True:
+        status, count = solve_structured(
+            A, B, s.c, Q, data.R, Q_f, stationary, s.x_0, r, s.lower, s.upper, rate_step, s.u_last,
+            s.normals, data.normal[:K], data.stage[:K], s.row_lower[:K], s.row_upper[:K], s.weight[:K],
+            data.iteration_limit, ws,
+        )  # fmt: skip
+        iterations += count
+        if status == OPTIMAL:
+            return level, iterations
+        if level == CLIPPED_SDRE:
+            return HOVER, iterations
+        if level == NONE and status == INFEASIBLE:
+            level = RELAXED
+            for k in range(K):
+                s.weight[k] = min(s.weight[k], RELAXED_WEIGHT)
+        elif has_plan:
+            return PREVIOUS_PLAN, iterations
+        else:
+            level = CLIPPED_SDRE
+            rate_step = math.inf
+            K = 0
+            _widen(s)
+
+
+@kernel
+def end_row(
+    level: int,
+    plant: Array,
+    last: Array,
+    revealed: Array,
+    memory: Array,
+    data: MpcData,
+    s: Scratch,
+    u: Array,
+    command: Array,
+    kept: Array,
+) -> None:
+    """The command of one decision, and its memory."""
+    N = u.shape[0]
+    plan, old = kept[1 : 1 + N_INPUT * N], memory[1 : 1 + N_INPUT * N]
+    for i in range(N):
+        for a in range(N_INPUT):
+            k = N_INPUT * i + a
+            if level == PREVIOUS_PLAN:
+                plan[k] = old[min(k + N_INPUT, N_INPUT * (N - 1) + a)]
+            elif level == HOVER:
+                plan[k] = data.coefficients[HOVER_FORCE]
+            else:
+                plan[k] = s.offset[a] + u[i, a]
+    kept[0] = 1.0 if level <= PREVIOUS_PLAN else 0.0
+    if level <= RELAXED:
+        for a in range(N_INPUT):
+            command[a] = min(max(plan[a], 0.0), data.force_max)
+    else:
+        limit_command(plan, last, data.rate_step, data.force_max, command)
+    if data.gain > 0.0:
+        remember(plant, command, revealed, s.estimate, kept[1 + N_INPUT * N :])

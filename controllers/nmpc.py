@@ -1,0 +1,288 @@
+"""Exact nonlinear MPC: real-time iteration or SQP to convergence on the structured QP; not in the dissertation.
+
+Multiple shooting: about a guess (X, F) one RK4 step per sample gives A_i, B_i and c_i = phi(X_i, F_i) - A_i X_i - B_i u_i;
+the QP's plan is the next guess. The cost is quadratic in a residual e(x), so Gauss-Newton is the whole Hessian but for
+second derivatives of e.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from quad_envs._numba import kernel
+from quad_envs.parameters import N_INPUT, N_STATE, Array
+from quad_envs.rotations import sincos, wrap_angle_scalar
+from quad_envs.tasks import Task
+
+from .controller import first_non_finite
+from .disturbance import ESTIMATOR_GAIN
+from .fallback import RELAXED
+from .model import RK4_SCRATCH, rk4_sensitivities, rotated_derivatives
+from .mpc import Frame, Mpc, MpcOptions, Problem, SolverName, require_choice
+from .mpc_kernels import MpcData, Scratch, begin_row, carve, end_row, solve_row
+from .ocp import IntArray
+from .solvers.structured import ITERATION_LIMIT, Workspace
+
+VelocityError = Literal["inertial", "body"]
+CONVERGED = 1e-6  # N, largest change of an input in the last pass
+_PITCH_LIMIT = 1.4  # rad, of the states at which the model is linearised
+_RK4 = RK4_SCRATCH * (N_STATE + N_INPUT)
+
+
+@kernel
+def load_guess(plan: Array, kept: Array, heading: bool, s: Scratch) -> None:
+    """The previous solution shifted by one sample, or the present state held.
+
+    Nothing depends on where the vehicle is and how it is headed, so the guess moves with its own first state.
+
+    Args:
+        plan: Whether a plan is held, then its rotor commands, (1 + 4N,).
+        kept: Whether a guess is held, then its states, (1 + 12 (N+1),).
+        heading: Whether the frame of the problem turned with the vehicle.
+        s: x_0 and offset are read; X and F are the results.
+    """
+    N = s.F.shape[0]
+    held = kept[0] > 0.0 and plan[0] > 0.0
+    old = kept[1:].reshape(N + 1, N_STATE)
+    first = old[1]
+    turn = first[8] if heading else 0.0
+    sine, cosine = sincos(turn)
+    yaw = s.x_0[8] - wrap_angle_scalar(s.x_0[8] - first[8]) - first[8]  # a multiple of 2 pi
+    if heading:
+        yaw = -first[8]
+    for i in range(N + 1):
+        if held:
+            X = old[min(i + 1, N)]
+            for a in range(N_STATE):
+                s.X[i, a] = X[a]
+            x, y = X[0] - first[0], X[1] - first[1]
+            s.X[i, 0] = s.x_0[0] + cosine * x + sine * y
+            s.X[i, 1] = s.x_0[1] + cosine * y - sine * x
+            s.X[i, 2] = s.x_0[2] + X[2] - first[2]
+            s.X[i, 8] = X[8] + yaw
+        else:
+            s.X[i, :] = s.x_0
+    for i in range(N):
+        for a in range(N_INPUT):
+            s.F[i, a] = plan[1 + N_INPUT * min(i + 1, N - 1) + a] if held else s.offset[a]
+    s.X[0, :] = s.x_0
+
+
+@kernel
+def linearise_model(data: MpcData, s: Scratch) -> None:
+    """A_i, B_i and c_i about the guess."""
+    point, x_next = s.square[9, 0], s.square[9, 1]
+    scratch = s.square.reshape(-1)[:_RK4].reshape(RK4_SCRATCH, N_STATE + N_INPUT)
+    for i in range(s.F.shape[0]):
+        point[:] = s.X[i]
+        point[7] = min(max(point[7], -_PITCH_LIMIT), _PITCH_LIMIT)
+        rk4_sensitivities(
+            point, s.F[i], s.d, data.coefficients, data.B_c, data.dt, x_next, s.A[i], s.B[i], scratch
+        )
+        for a in range(N_STATE):
+            total = x_next[a]
+            for b in range(N_STATE):
+                total -= s.A[i, a, b] * point[b]
+            for b in range(N_INPUT):
+                total -= s.B[i, a, b] * (s.F[i, b] - s.offset[b])
+            s.c[i, a] = total
+
+
+@kernel
+def velocity_residual(Theta: Array, v_ref: Array, D: Array) -> tuple[float, float, float]:
+    """R_BI(Theta) v_ref, and its derivative by Theta.
+
+    Args:
+        Theta: Roll, pitch, yaw, (3,).
+        v_ref: In the axes from which yaw counts, (3,).
+        D: Result, (3, 3).
+    """
+    sf, cf = sincos(Theta[0])
+    st, ct = sincos(Theta[1])
+    ss, cs = sincos(Theta[2])
+    G = rotated_derivatives(sf, cf, st, ct, ss, cs, v_ref[0], v_ref[1], v_ref[2])
+    for a in range(3):
+        D[0, a], D[1, a], D[2, a] = G[a], G[3 + a], G[6 + a]
+    forward = cs * v_ref[0] + ss * v_ref[1]
+    side = cs * v_ref[1] - ss * v_ref[0]
+    down = st * forward + ct * v_ref[2]
+    return ct * forward - st * v_ref[2], sf * down + cf * side, cf * down - sf * side
+
+
+@kernel
+def gauss_newton_weight(Q: Array, D: Array, out: Array) -> None:
+    """E'Q E for E = I but for the block (V_B, Theta) = -D; the derivative of the residual.
+
+    Args:
+        Q: (12, 12), symmetric.
+        D: (3, 3).
+        out: Result, (12, 12).
+    """
+    n = N_STATE
+    for i in range(n):
+        for j in range(n):
+            out[i, j] = Q[i, j]
+    for i in range(n):
+        for a in range(3):
+            for k in range(3):
+                out[i, 6 + a] -= Q[i, 3 + k] * D[k, a]
+    for a in range(3):
+        for j in range(n):
+            total = 0.0
+            for k in range(3):
+                total += D[k, a] * out[3 + k, j]
+            out[6 + a, j] -= total
+
+
+@kernel
+def linearise_cost(inertial: bool, data: MpcData, s: Scratch) -> None:
+    """Stage weights Q_i = E_i'Q E_i and references X_i - E_i^-1 e(X_i) about the guess.
+
+    The residual is that of the reward: e = [p - p_ref; V_B - R_BI(Theta) v_ref; Theta - Theta_ref; Omega], yaw wrapped.
+    """
+    N = s.F.shape[0]
+    D = s.square[9, 2:5, :3]
+    D[:, :] = 0.0
+    for i in range(N + 1):
+        r, X = s.target[i], s.X[i]
+        for a in range(N_STATE):
+            r[a] = s.r[i, a]
+        if data.heading:
+            r[8] = X[8] - wrap_angle_scalar(X[8] - r[8])
+        if inertial:
+            v = velocity_residual(X[6:9], s.r[i, 3:6], D)
+            for k in range(3):
+                r[3 + k] = v[k]
+                for a in range(3):
+                    r[3 + k] -= D[k, a] * (X[6 + a] - r[6 + a])
+        if i < N:
+            gauss_newton_weight(data.Q[0], D, s.Q[i])
+        else:
+            gauss_newton_weight(data.P, D, s.P)
+
+
+@kernel
+def take_step(u: Array, x: Array, s: Scratch) -> float:
+    """The plan becomes the guess; returns the largest change of an input, N."""
+    change = 0.0
+    for i in range(u.shape[0]):
+        for a in range(N_INPUT):
+            F = s.offset[a] + u[i, a]
+            change = max(change, abs(F - s.F[i, a]))
+            s.F[i, a] = F
+    s.X[:, :] = x
+    return change
+
+
+@kernel
+def keep_guess(valid: bool, X: Array, kept: Array) -> None:
+    """Write the guess to memory; after a failure the next sample starts afresh."""
+    kept[:] = 0.0
+    if valid:
+        kept[0] = 1.0
+        kept[1:].reshape(X.shape)[:, :] = X
+
+
+@kernel
+def _decide_rows(
+    plants: Array,
+    windows: Array,
+    lasts: Array,
+    disturbances: Array,
+    memories: Array,
+    commands: Array,
+    kept: Array,
+    report: IntArray,
+    which: IntArray,
+    passes: int,
+    inertial: bool,
+    keep_from: int,
+    data: MpcData,
+    buffer: Array,
+    ws: Workspace,
+) -> int:
+    """One decision per row; -1, or the code of the first argument that is not finite."""
+    N = ws.u.shape[0]
+    bad = first_non_finite(plants, windows, lasts, disturbances, memories, N + 1)
+    if bad >= 0:
+        return bad
+    s = carve(buffer, N, N, data.normals.shape[0], data.normal.shape[0], N)
+    for j in range(plants.shape[0]):
+        begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
+        load_guess(memories[j], memories[j, keep_from:], data.heading, s)
+        worst, iterations = 0, 0
+        for _ in range(passes):
+            linearise_model(data, s)
+            linearise_cost(inertial, data, s)
+            level, count = solve_row(s.A, s.B, s.Q, s.P, False, s.target, memories[j, 0] > 0.0, data, s, ws)
+            worst, iterations = max(worst, level), iterations + count
+            if level > RELAXED or take_step(ws.u, ws.x, s) < CONVERGED:
+                break
+        end_row(worst, plants[j], lasts[j], disturbances[j], memories[j], data, s, ws.u, commands[j], kept[j])
+        keep_guess(worst <= RELAXED, s.X, kept[j, keep_from:])
+        report[0, j], report[1, j] = worst, iterations
+    return bad
+
+
+class ExactNmpc(Mpc):
+    """MPC on the exact model (without rotor lag), with the stage cost of the reward.
+
+    Args:
+        task: What is known of the flight.
+        horizon: N, samples.
+        passes: 1: real-time iteration, one QP per sample about the shifted solution; more: SQP until no input changes
+            by 1e-6 N, 30 is ample.
+        velocity_error: "inertial": V_B - R_BI(Theta) v_ref with the predicted attitude, as the reward has it;
+            "body": V_B - v_ref, v_ref turned by the present heading (frame "heading") or not (frame "hover").
+        solver: See `LinearMPC`, as the options that follow.
+        frame: "heading" or "hover".
+        soft_weight: Exact penalty per unit of a state row; inf makes the rows hard.
+        reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
+        estimator_gain: Share of each new residual in the estimate, in (0, 1].
+        iteration_limit: Largest number of active-set steps of a solve.
+
+    Raises:
+        ValueError: If an option is not allowed.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        horizon: int = 25,
+        passes: int = 1,
+        velocity_error: VelocityError = "inertial",
+        *,
+        solver: SolverName = "structured",
+        frame: Frame = "heading",
+        soft_weight: float = 1e3,
+        reject_disturbance: bool = False,
+        estimator_gain: float = ESTIMATOR_GAIN,
+        iteration_limit: int = ITERATION_LIMIT,
+    ) -> None:
+        if passes != int(passes) or passes < 1:
+            raise ValueError(f"passes must be a whole number >= 1, got {passes!r}")
+        require_choice("velocity_error", velocity_error, VelocityError)
+        options = MpcOptions(
+            solver, frame, "heading", soft_weight, reject_disturbance, estimator_gain, iteration_limit
+        )
+        super().__init__(task, horizon, options, pairs=horizon, guess=True)
+        self.passes = int(passes)
+        self.velocity_error = velocity_error
+
+    def _decide_rows(self, *arrays: Array) -> int:
+        which, buffer, ws = self._scratch()
+        inertial = self.velocity_error == "inertial"
+        return _decide_rows(*arrays, which, self.passes, inertial, self._keep_from, self._data, buffer, ws)
+
+    def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
+        if number == 0:
+            load_guess(memory, memory[self._keep_from :], self._data.heading, s)
+        linearise_model(self._data, s)
+        linearise_cost(self.velocity_error == "inertial", self._data, s)
+        return Problem(s.A, s.B, s.Q, s.P, False, s.target)
+
+    def _accept(self, number: int, s: Scratch, ws: Workspace) -> bool:
+        return take_step(ws.u, ws.x, s) < CONVERGED or number == self.passes - 1
+
+    def _keep(self, level: int, kept: Array, s: Scratch) -> None:
+        keep_guess(level <= RELAXED, s.X, kept[self._keep_from :])

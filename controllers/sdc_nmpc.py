@@ -1,0 +1,178 @@
+"""SDC-NMPC: MPC on the state-dependent-coefficient model of chapter 4, Eqs. (4.8) to (4.11)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from quad_envs._numba import kernel
+from quad_envs.parameters import N_STATE, Array
+from quad_envs.tasks import Task
+
+from .controller import first_non_finite
+from .disturbance import ESTIMATOR_GAIN
+from .fallback import RELAXED
+from .model import sdc_matrix, zero_order_hold
+from .mpc import Frame, Mpc, MpcOptions, Problem, SolverName, VelocityReference, require_choice
+from .mpc_kernels import MpcData, Scratch, begin_row, carve, end_row, hold_trim, solve_row
+from .ocp import IntArray
+from .riccati import solve_dare
+from .solvers.structured import ITERATION_LIMIT, Workspace
+
+TerminalWeight = Literal["hover", "sdre"]
+_TILT_LIMIT = 1.4  # rad, of roll and pitch of the states at which the model is taken again
+
+
+@kernel
+def freeze_model(alpha: float, sdre_weight: bool, data: MpcData, s: Scratch) -> bool:
+    """The pair at x_0 for the whole horizon, and the terminal weight.
+
+    Returns:
+        Whether the terminal weight solves the Riccati equation of the pair.
+    """
+    sdc_matrix(s.x_0, alpha, data.coefficients, s.A_c)
+    zero_order_hold(s.A_c, data.B_c, data.dt, s.A[0], s.B[0], s.square)
+    for i in range(s.c.shape[0]):
+        hold_trim(s.A[0], s.trim, s.c[i])
+    if sdre_weight and solve_dare(s.A[0], s.B[0], data.Q[0], data.R, s.P, s.square) > 0:
+        return True
+    s.P[:, :] = data.P
+    return False
+
+
+@kernel
+def relinearise(u: Array, alpha: float, data: MpcData, s: Scratch) -> None:
+    """The N pairs met along x_{i+1} = A(x_i) x_i + B(x_i) u_i + c_i under the plan u; memoryless."""
+    x, x_next = s.square[3, 0], s.square[3, 1]
+    x[:] = s.x_0
+    for i in range(u.shape[0]):
+        sdc_matrix(x, alpha, data.coefficients, s.A_c)
+        zero_order_hold(s.A_c, data.B_c, data.dt, s.A[i], s.B[i], s.square)
+        hold_trim(s.A[i], s.trim, s.c[i])
+        for a in range(N_STATE):
+            total = s.c[i, a]
+            for b in range(N_STATE):
+                total += s.A[i, a, b] * x[b]
+            for b in range(u.shape[1]):
+                total += s.B[i, a, b] * u[i, b]
+            x_next[a] = total
+        x[:] = x_next
+        x[6] = min(max(x[6], -_TILT_LIMIT), _TILT_LIMIT)
+        x[7] = min(max(x[7], -_TILT_LIMIT), _TILT_LIMIT)
+
+
+@kernel
+def _decide_rows(
+    plants: Array,
+    windows: Array,
+    lasts: Array,
+    disturbances: Array,
+    memories: Array,
+    commands: Array,
+    kept: Array,
+    report: IntArray,
+    which: IntArray,
+    alpha: float,
+    relinearisations: int,
+    sdre_weight: bool,
+    data: MpcData,
+    buffer: Array,
+    ws: Workspace,
+) -> int:
+    """One decision per row; -1, or the code of the first argument that is not finite."""
+    N = ws.u.shape[0]
+    bad = first_non_finite(plants, windows, lasts, disturbances, memories, N + 1)
+    if bad >= 0:
+        return bad
+    pairs = N if relinearisations > 0 else 1
+    s = carve(buffer, N, pairs, data.normals.shape[0], data.normal.shape[0], 0)
+    for j in range(plants.shape[0]):
+        begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
+        worst, iterations = 0, 0
+        stationary = freeze_model(alpha, sdre_weight, data, s)
+        for k in range(1 + relinearisations):
+            pairs = 1
+            if k > 0:
+                relinearise(ws.u, alpha, data, s)
+                stationary, pairs = False, N
+            level, count = solve_row(
+                s.A[:pairs], s.B[:pairs], data.Q, s.P, stationary, s.r, memories[j, 0] > 0.0, data, s, ws
+            )
+            worst, iterations = max(worst, level), iterations + count
+            if level > RELAXED:
+                break
+        end_row(worst, plants[j], lasts[j], disturbances[j], memories[j], data, s, ws.u, commands[j], kept[j])
+        report[0, j], report[1, j] = worst, iterations
+    return bad
+
+
+class SdcNmpc(Mpc):
+    """MPC on x' = A_c(x) x + B_c u, exact for the present state and frozen over the horizon.
+
+    Deviation:
+        alpha = 1 by default; 1/2 is the dissertation's factorisation (4.6), under which the present body rates stay
+        frozen in the prediction and go on turning V_B: it loses a climbing helix. Frames as in `LinearMPC`.
+
+    Args:
+        task: What is known of the flight.
+        horizon: N, samples.
+        alpha: Member of the family of factorisations, in [0, 1]; see `model.sdc_matrix`.
+        relinearisations: Further passes, each with the pairs along the plan of the pass before; 0 is the dissertation's.
+        terminal_weight: "hover": P of the hover model; "sdre": P of the present pair.
+        solver: See `LinearMPC`, as the options that follow.
+        frame: "heading" or "hover".
+        velocity_reference: "heading" or "attitude".
+        soft_weight: Exact penalty per unit of a state row; inf makes the rows hard.
+        reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
+        estimator_gain: Share of each new residual in the estimate, in (0, 1].
+        iteration_limit: Largest number of active-set steps of a solve.
+
+    Raises:
+        ValueError: If an option is not allowed.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        horizon: int = 25,
+        alpha: float = 1.0,
+        relinearisations: int = 0,
+        terminal_weight: TerminalWeight = "hover",
+        *,
+        solver: SolverName = "structured",
+        frame: Frame = "heading",
+        velocity_reference: VelocityReference = "heading",
+        soft_weight: float = 1e3,
+        reject_disturbance: bool = False,
+        estimator_gain: float = ESTIMATOR_GAIN,
+        iteration_limit: int = ITERATION_LIMIT,
+    ) -> None:
+        if not 0.0 <= alpha <= 1.0:
+            raise ValueError(f"alpha must lie in [0, 1], got {alpha!r}; 1/2 is the dissertation's, 1 recommended")
+        if relinearisations != int(relinearisations) or relinearisations < 0:
+            raise ValueError(f"relinearisations must be a whole number >= 0, got {relinearisations!r}")
+        require_choice("terminal_weight", terminal_weight, TerminalWeight)
+        options = MpcOptions(
+            solver, frame, velocity_reference, soft_weight, reject_disturbance, estimator_gain, iteration_limit
+        )
+        super().__init__(task, horizon, options, pairs=horizon if relinearisations else 1, guess=False)
+        self.alpha = float(alpha)
+        self.relinearisations = int(relinearisations)
+        self.terminal_weight = terminal_weight
+
+    def _decide_rows(self, *arrays: Array) -> int:
+        which, buffer, ws = self._scratch()
+        return _decide_rows(
+            *arrays, which, self.alpha, self.relinearisations, self.terminal_weight == "sdre", self._data, buffer, ws
+        )
+
+    def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
+        stationary, pairs = False, 1
+        if number == 0:
+            stationary = freeze_model(self.alpha, self.terminal_weight == "sdre", self._data, s)
+        else:
+            relinearise(ws.u, self.alpha, self._data, s)
+            pairs = self.horizon
+        return Problem(s.A[:pairs], s.B[:pairs], self._data.Q, s.P, stationary, s.r)
+
+    def _accept(self, number: int, s: Scratch, ws: Workspace) -> bool:
+        return number == self.relinearisations
