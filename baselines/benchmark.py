@@ -19,11 +19,11 @@ from .evaluation import Evaluation, evaluate
 from .policy import make_policy
 from .results import (
     discard,
-    git_revision,
     locked,
     plain_json,
     provenance,
     read_json,
+    source_digest,
     write_atomic,
     write_csv,
     write_json,
@@ -142,11 +142,10 @@ def _begin(folder: Path | None, suite: Suite, units: Sequence[Unit]) -> dict[int
             f"{str(folder)!r} holds another suite (it differs in {differing}); choose another folder, "
             "or discard it with fresh=True (--fresh)"
         )
-    revision = git_revision()
-    if stored.get("git_revision") != revision:
+    if stored.get("source") != source_digest():
         raise ResultsError(
-            f"{str(folder)!r} was begun with revision {stored.get('git_revision')} and this is {revision}: "
-            "they do not belong in one table; choose another folder, or discard it with fresh=True (--fresh)"
+            f"{str(folder)!r} was begun with other sources, of revision {stored.get('git_revision')}: their numbers "
+            "do not mix; choose another folder, or discard it with fresh=True (--fresh)"
         )
     return dict(_stored_units(folder, units))
 

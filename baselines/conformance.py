@@ -35,11 +35,11 @@ def check_policy(policy: Policy, env: Any, seed: int = 0) -> None:
         raise PolicyCheckError(f"{policy!r} has no predict(observation, state, episode_start, deterministic)")
     env = make_env(env) if isinstance(env, str) else env
     flights = _collect(policy, env, seed)
-    _check_single(policy, env, flights)
     _check_determinism(policy, flights)
+    _check_single(policy, env, flights)
     _check_no_mutation(policy, flights)
-    _check_episode_start(policy, flights)
     _check_rows(policy, flights)
+    _check_episode_start(policy, flights)
     _check_interleaving(policy, flights)
     _check_pickling(policy, flights)
 

@@ -10,6 +10,7 @@ summary.csv        one row per environment x policy
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import json
 import math
@@ -180,9 +181,19 @@ def provenance() -> dict[str, Any]:
             **{name: metadata.version(name) for name in _DISTRIBUTIONS},
         },
         "git_revision": git_revision(),
+        "source": source_digest(),
         "platform": platform.platform(),
         "command": sys.argv,
     }
+
+
+def source_digest() -> str:
+    """Digest of the sources of the three packages, so that results of different code are not mixed."""
+    home, digest = Path(quad_envs.__file__).resolve().parents[1], hashlib.sha256()
+    for package in ("quad_envs", "controllers", "baselines"):
+        for path in sorted((home / package).rglob("*.py")):
+            digest.update(str(path.relative_to(home)).encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def git_revision() -> str | None:

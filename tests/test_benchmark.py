@@ -1,0 +1,305 @@
+"""Suites and results folders: complete, resumable, never half-written."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import json
+import os
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import baselines.benchmark
+import baselines.results
+from baselines import Results, ResultsError, Suite, load_suite, run_benchmark
+from baselines.evaluation import Evaluation
+from baselines.policy import TRACKING_POLICIES
+from baselines.results import locked, plain_json, write_atomic, write_csv
+from baselines.suite import suite_names
+from quad_envs.registration import TRACKING
+
+SMALL = {
+    "name": "small",
+    "episodes": 3,
+    "seed": 5,
+    "envs": [
+        "quad/HelixTracking-v0",
+        {"id": "quad/Regulation-v0", "kwargs": {"kappa": 0.3, "tilt_limit": 0.3}},
+    ],
+    "policies": ["hover", {"name": "random", "kwargs": {"seed": 1}, "label": "dice"}],
+}
+TIMES = ("decision_p50_ms", "decision_p99_ms", "decision_max_ms")
+
+
+def without_times(rows):
+    return [{key: str(value) for key, value in row.items() if key not in TIMES} for row in rows]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A complete sweep and its folder."""
+    folder = tmp_path_factory.mktemp("runs") / "small"
+    return run_benchmark(SMALL, folder, save_episodes=True), folder
+
+
+@pytest.fixture
+def flown(monkeypatch):
+    """Titles of the units that are flown."""
+    titles = []
+    real = baselines.benchmark.fly_unit
+
+    def count(unit):
+        titles.append((unit.env.title, unit.policy.title))
+        return real(unit)
+
+    monkeypatch.setattr(baselines.benchmark, "fly_unit", count)
+    return titles
+
+
+def test_every_policy_flies_in_every_environment_from_the_same_seeds(finished):
+    rows = finished[0].rows()
+    assert len(rows) == 2 * 2 * 3
+    assert {row["env"] for row in rows} == {
+        "quad/HelixTracking-v0",
+        "quad/Regulation-v0, kappa=0.3, tilt_limit=0.3",
+    }
+    assert {row["policy"] for row in rows} == {"hover", "dice"}
+    assert [row["seed"] for row in rows[:3]] == [5, 6, 7]
+
+
+def test_the_folder_holds_configuration_results_summary_and_flights(finished):
+    results, folder = finished
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "cells", "config.json", "episodes", "results.csv", "summary.csv",
+    ]  # fmt: skip
+    config = json.loads((folder / "config.json").read_text())
+    assert config["suite"]["episodes"] == 3 and "numba" in config["versions"] and "git_revision" in config
+    with open(folder / "results.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["score"] for row in rows] == [str(row["score"]) for row in results.rows()]
+    assert len(list((folder / "episodes").iterdir())) == 12
+
+
+def test_a_saved_flight_has_its_arrays(finished):
+    path = sorted((finished[1] / "episodes").iterdir())[0]
+    with np.load(path) as arrays:
+        assert arrays["states"].shape == (201, 16) and arrays["commands"].shape == (200, 4)
+
+
+def test_differences_are_taken_from_the_first_policy_or_the_named_one(finished):
+    rows = {(row["env"], row["policy"]): row for row in finished[0].summary()}
+    hover, dice = (rows["quad/HelixTracking-v0", name] for name in ("hover", "dice"))
+    assert hover["score_minus_base"] == 0.0
+    assert dice["score_minus_base"] == pytest.approx(dice["score"] - hover["score"])
+    assert load_suite(SMALL | {"compare_with": "dice"}).base == "dice"
+
+
+def test_the_table_has_a_line_for_each_policy_and_environment(finished):
+    text = str(finished[0])
+    assert text.count("hover ") >= 2 and text.count("dice ") == 2 and "seeds 5 to 7" in text
+
+
+def test_several_processes_find_the_same(finished):
+    results = run_benchmark(SMALL, jobs=2)
+    assert without_times(results.rows()) == without_times(finished[0].rows())
+
+
+def test_an_interrupted_sweep_goes_on_where_it_stopped(tmp_path, flown, finished):
+    def interrupt(count, total):
+        if count == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_benchmark(SMALL, tmp_path, on_unit=interrupt)
+    assert len(flown) == 2 and not (tmp_path / "results.csv").exists() and not (tmp_path / ".lock").exists()
+    results = run_benchmark(SMALL, tmp_path)
+    assert len(flown) == 4 and len(set(flown)) == 4
+    assert without_times(results.rows()) == without_times(finished[0].rows())
+
+
+def test_a_complete_sweep_is_read_and_not_flown_again(tmp_path, flown):
+    first = run_benchmark(SMALL, tmp_path)
+    again = run_benchmark(SMALL, tmp_path)
+    assert len(flown) == 4 and str(again) == str(first)
+
+
+def test_a_fresh_run_discards_what_the_folder_holds_and_nothing_else(tmp_path, flown):
+    run_benchmark(SMALL, tmp_path)
+    (tmp_path / "notes.txt").write_text("mine")
+    run_benchmark(SMALL | {"episodes": 1}, tmp_path, fresh=True)
+    assert len(flown) == 8 and (tmp_path / "notes.txt").exists()
+
+
+def test_another_suite_in_the_same_folder_is_refused(tmp_path):
+    run_benchmark(SMALL, tmp_path)
+    with pytest.raises(ResultsError, match=r"holds another suite \(it differs in episodes, seed\)"):
+        run_benchmark(SMALL | {"episodes": 4, "seed": 0}, tmp_path)
+
+
+def test_results_of_other_sources_are_not_mixed(tmp_path, monkeypatch):
+    run_benchmark(SMALL, tmp_path)
+    monkeypatch.setattr(baselines.benchmark, "source_digest", lambda: "0123abc")
+    with pytest.raises(ResultsError, match="begun with other sources"):
+        run_benchmark(SMALL, tmp_path)
+
+
+def test_a_folder_in_use_is_refused(tmp_path):
+    with locked(tmp_path), pytest.raises(ResultsError, match=f"in use by process {os.getpid()}"):
+        run_benchmark(SMALL, tmp_path)
+    assert not (tmp_path / ".lock").exists()
+
+
+def test_the_lock_of_a_process_that_is_no_more_is_removed(tmp_path):
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    (tmp_path / ".lock").write_text(json.dumps({"pid": gone.pid, "host": socket.gethostname()}))
+    with locked(tmp_path):
+        assert json.loads((tmp_path / ".lock").read_text())["pid"] == os.getpid()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_lock_of_another_machine_stays(tmp_path):
+    (tmp_path / ".lock").write_text(json.dumps({"pid": 1, "host": "elsewhere"}))
+    with pytest.raises(ResultsError, match="process 1 on elsewhere"), locked(tmp_path):
+        pass
+    assert (tmp_path / ".lock").exists()
+
+
+def test_a_file_in_place_of_the_folder_is_refused(tmp_path):
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(ResultsError, match="taken' is a file"):
+        run_benchmark(SMALL, tmp_path / "taken")
+    with pytest.raises(ResultsError, match="cannot write into"):
+        run_benchmark(SMALL, tmp_path / "taken" / "below")
+
+
+def test_a_full_disk_leaves_no_half_written_file(tmp_path, monkeypatch):
+    write_atomic(tmp_path / "a", b"old")
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(
+        ResultsError, match=r"cannot write .*No space left on device.*finished units are kept"
+    ):
+        write_atomic(tmp_path / "a", b"new")
+    assert (tmp_path / "a").read_bytes() == b"old" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_damaged_cell_is_named(tmp_path):
+    run_benchmark(SMALL, tmp_path)
+    cell = sorted((tmp_path / "cells").iterdir())[1]
+    cell.write_text("{")
+    with pytest.raises(ResultsError, match=f"cannot read .*{cell.name}.*delete it to fly this unit again"):
+        run_benchmark(SMALL, tmp_path)
+
+
+def test_stored_evaluations_read_back_as_they_were(finished):
+    for evaluation in finished[0].evaluations:
+        text = json.dumps(evaluation.to_plain(), allow_nan=False)
+        assert repr(Evaluation.from_plain(json.loads(text))) == repr(evaluation)  # as nan != nan
+
+
+def test_plain_json_turns_what_json_lacks_into_null():
+    assert plain_json({"a": (np.float64("nan"), float("inf"), np.int64(3), np.arange(2), True, "x")}) == {
+        "a": [None, None, 3, [0, 1], True, "x"]
+    }
+
+
+def test_csv_rows_may_have_different_columns(tmp_path):
+    write_csv(tmp_path / "t.csv", [{"a": 1, "b": float("nan")}, {"a": 2, "c": "x,y"}])
+    assert (tmp_path / "t.csv").read_text().splitlines() == ["a,b,c", "1,,", '2,,"x,y"']
+
+
+# ---------------------------------------------------------------- suites
+
+
+def test_the_default_suite_is_everything():
+    suite = load_suite("default")
+    assert [env.id for env in suite.envs] == list(TRACKING)
+    assert [policy.name for policy in suite.policies] == list(TRACKING_POLICIES)
+
+
+@pytest.mark.parametrize("name", suite_names())
+def test_every_shipped_suite_loads(name):
+    assert isinstance(load_suite(name), Suite) and suite_names()[name]
+
+
+def test_a_suite_is_read_from_a_file(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(
+        'envs = ["quad/HelixTracking-v0"]\nepisodes = 2\n'
+        '[[policies]]\nname = "lmpc"\nkwargs = {horizon = 15}\nlabel = "short"\n'
+    )
+    suite = load_suite(path)
+    assert (suite.name, suite.episodes, suite.policies[0].title) == ("mine", 2, "short")
+    assert suite.policies[0].kwargs == {"horizon": 15}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"episode": 3}, "did you mean 'episodes'"),
+        ({"episodes": 0}, "episodes of suite .* must be a whole number >= 1, got 0"),
+        ({"episodes": 2.5}, "must be a whole number"),
+        ({"seed": -1}, "seed of suite"),
+        ({"envs": []}, "has no envs"),
+        ({"envs": ["quad/Helix-v0"]}, "did you mean 'quad/HelixTracking-v0'"),
+        ({"envs": "some"}, 'list of tables with .id., or "all"'),
+        ({"policies": [{"kwargs": {}}]}, "each table needs 'name'"),
+        ({"policies": [{"name": "hover", "kwarg": {}}]}, "did you mean 'kwargs'"),
+        ({"policies": ["hover", "hover"]}, "'hover' twice in policies; give them labels"),
+        ({"compare_with": "lmpc"}, "unknown compare_with"),
+        ({"policies": [{"name": "random", "kwargs": {"sed": 1}}]}, "did you mean 'seed'"),
+        ({"envs": [{"id": "quad/HelixTracking-v0", "kwargs": {"kapa": 1.0}}]}, "did you mean 'kappa'"),
+        ({"envs": [{"id": "quad/HelixTracking-v0", "kwargs": {"kappa": 0.2}}]}, "kappa must lie in"),
+    ],
+)
+def test_a_mistake_in_a_suite_is_refused_before_anything_is_flown(change, message, flown):
+    with pytest.raises(ValueError, match=message):
+        run_benchmark(SMALL | change)
+    assert not flown
+
+
+def test_a_suite_that_does_not_exist_is_refused_with_a_suggestion(tmp_path):
+    with pytest.raises(ValueError, match="unknown suite 'defualt'; did you mean 'default'"):
+        load_suite("defualt")
+    with pytest.raises(ValueError, match="there is no suite file"):
+        load_suite(tmp_path / "none.toml")
+    (tmp_path / "bad.toml").write_text("envs = [")
+    with pytest.raises(ValueError, match="is not valid TOML"):
+        load_suite(tmp_path / "bad.toml")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"engine": "rya"}, "unknown engine 'rya'; did you mean 'ray'"),
+        ({"jobs": 0}, "jobs must be a whole number >= 1, got 0"),
+        ({"save_episodes": True}, "save_episodes needs a folder"),
+    ],
+)
+def test_bad_arguments_of_a_sweep_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        run_benchmark(SMALL, **arguments)
+
+
+@pytest.mark.parametrize(("engine", "package"), [("ray", "ray"), ("dask", "distributed")])
+def test_an_engine_that_is_not_installed_says_how_to_install_it(engine, package, monkeypatch):
+    monkeypatch.setattr(baselines.engines, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=f"needs the package {package}: pip install"):
+        run_benchmark(SMALL, engine=engine)
+
+
+def test_results_are_found_by_title(finished):
+    results: Results = finished[0]
+    assert results.get("quad/HelixTracking-v0", "dice").policy == "random"
+    with pytest.raises(KeyError, match="no evaluation of 'lqr'"):
+        results.get("quad/HelixTracking-v0", "lqr")
+    assert replace(results.suite, seed=6).seed == 6

@@ -1,0 +1,196 @@
+"""The command line: what it prints where, and how it ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from baselines.__main__ import COMMANDS, main
+from baselines.options import read_assignments
+from baselines.policy import TRACKING_POLICIES
+from quad_envs.registration import TRACKING
+
+HELIX = "quad/HelixTracking-v0"
+RUN = [sys.executable, "-m", "baselines"]
+
+
+def fails(capsys, *arguments):
+    """The one line that bad input gets."""
+    try:
+        code = main(arguments)
+    except SystemExit as end:
+        code = end.code
+    out, err = capsys.readouterr()
+    assert code == 2 and out == "" and err.count("\n") == 1 and "Traceback" not in err
+    return err
+
+
+def test_evaluate_prints_a_table(capsys):
+    assert main(["evaluate", HELIX, "hover", "--episodes", "2"]) == 0
+    out, err = capsys.readouterr()
+    assert out.startswith(f"hover on {HELIX}, 2 flights from seed 0") and "position_rms" in out
+    assert "%" not in err  # no progress bar where nobody watches
+
+
+def test_evaluate_as_json_prints_json_alone(capsys):
+    assert main(["evaluate", HELIX, "random", "--episodes", "2", "--seed", "3", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["policy"], found["seed"], found["episodes"]) == ("random", 3, 2)
+    assert [record["seed"] for record in found["records"]] == [3, 4]
+
+
+def test_set_reaches_the_environment_and_policy_set_the_policy(capsys):
+    arguments = ["--episodes", "1", "--json"]
+    main(["evaluate", HELIX, "random", *arguments, "--set", "kappa=0.3125", "--set", "tilt_limit=.3"])
+    first = json.loads(capsys.readouterr().out)
+    main(["evaluate", HELIX, "random", *arguments, "--policy-set", "seed=4"])
+    second = json.loads(capsys.readouterr().out)
+    assert "tilt" in first["worst_violation"] and second["worst_violation"] == {}
+    assert first["summary"]["effort"]["mean"] < second["summary"]["effort"]["mean"]
+
+
+def test_assignments_are_json_or_python_or_text():
+    texts = ["a=1", "b=.5", "c=[1, 2]", "d=true", "e=wind", "f=x=y", "g=None", 'h={"mass": 0.1}']
+    expected = {
+        "a": 1,
+        "b": 0.5,
+        "c": [1, 2],
+        "d": True,
+        "e": "wind",
+        "f": "x=y",
+        "g": None,
+        "h": {"mass": 0.1},
+    }
+    assert read_assignments("--set", texts) == expected
+
+
+def test_evaluate_leaves_a_results_folder(capsys, tmp_path):
+    out = tmp_path / "run"
+    assert (
+        main(["evaluate", HELIX, "hover", "--episodes", "2", "--out", str(out), "--save-episodes", "--json"])
+        == 0
+    )
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["policy"] == "hover" and (out / "results.csv").is_file()
+    assert len(list((out / "episodes").iterdir())) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["evalute", HELIX, "hover"], "unknown command 'evalute'; did you mean 'evaluate'"),
+        (["evaluate", "quad/HelixTrack-v0", "hover"], "did you mean 'quad/HelixTracking-v0'"),
+        (["evaluate", HELIX, "hovr"], "unknown policy 'hovr'; did you mean 'hover'"),
+        (["evaluate", HELIX, "random", "--policy-set", "sed=1"], "did you mean 'seed'"),
+        (["evaluate", HELIX, "hover", "--set", "kapa=1"], "did you mean 'kappa'"),
+        (["evaluate", HELIX, "hover", "--set", "kappa=0.2"], "kappa must lie in (1/4, 1]"),
+        (["evaluate", HELIX, "hover", "--set", "kappa"], "--set needs KEY=VALUE"),
+        (["evaluate", HELIX, "hover", "--set", "kappa=1", "--set", "kappa=1"], "sets 'kappa' twice"),
+        (["evaluate", HELIX, "hover", "--episodes", "0"], "episodes must be a whole number >= 1, got 0"),
+        (["evaluate", HELIX, "hover", "--episodes", "many"], "invalid int value: 'many'"),
+        (["evaluate", HELIX, "hover", "--episode", "3"], "did you mean '--episodes'"),
+        (["evaluate", HELIX, "hover", "more"], "unexpected argument 'more'"),
+        (["evaluate", HELIX, "hover", "--save-episodes"], "needs a folder: --out FOLDER"),
+        (["evaluate", HELIX], "required: policy"),
+        ([], "required: COMMAND"),
+        (["benchmark", "quik"], "unknown suite 'quik'; did you mean 'quick'"),
+        (["benchmark", "quick", "--engine", "processe"], "did you mean 'processes'"),
+        (["list", "hovr"], "did you mean 'hover'"),
+    ],
+)
+def test_bad_input_gets_one_clear_line_and_exit_code_2(capsys, arguments, message):
+    assert message in fails(capsys, *arguments)
+
+
+def test_a_folder_that_cannot_be_written_gets_one_clear_line(capsys, tmp_path):
+    (tmp_path / "file").write_text("")
+    message = fails(capsys, "evaluate", HELIX, "hover", "--episodes", "1", "--out", str(tmp_path / "file"))
+    assert "is a file, not a folder" in message
+
+
+def test_list_names_every_environment_and_policy(capsys):
+    assert main(["list", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert set(found["environments"]) == set(TRACKING) and set(found["policies"]) == set(TRACKING_POLICIES)
+    assert main(["list"]) == 0
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in (*TRACKING, *TRACKING_POLICIES))
+
+
+@pytest.mark.parametrize(("name", "option"), [(HELIX, "reference"), ("random", "seed")])
+def test_list_shows_the_options_of_a_name(capsys, name, option):
+    assert main(["list", name, "--json"]) == 0
+    assert option in json.loads(capsys.readouterr().out)
+
+
+def test_benchmark_prints_tables_and_says_where_the_results_are(capsys, tmp_path):
+    suite = tmp_path / "two.toml"
+    suite.write_text('envs = ["quad/HelixTracking-v0"]\npolicies = ["hover", "random"]\nepisodes = 9\n')
+    out = tmp_path / "run"
+    assert main(["benchmark", str(suite), "--episodes", "2", "--out", str(out)]) == 0
+    printed, said = capsys.readouterr()
+    assert "RMS m" in printed and f"results in {out}" in said
+    assert json.loads((out / "config.json").read_text())["suite"]["episodes"] == 2
+
+
+def test_help_and_list_load_nothing_heavy():
+    code = (
+        "import sys; from baselines.__main__ import main, make_parser; make_parser().format_help();"
+        "main(['list']);"
+        "print([m for m in ('numba', 'scipy', 'joblib', 'osqp', 'controllers', 'torch') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_every_command_has_a_help_page(capsys):
+    for name in COMMANDS:
+        with pytest.raises(SystemExit) as end:
+            main([name, "--help"])
+        assert end.value.code == 0 and capsys.readouterr().out.startswith(f"usage: quad-envs {name}")
+
+
+def test_a_reader_that_leaves_is_no_error():
+    with subprocess.Popen([*RUN, "list"], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
+        assert process.wait() == 141
+
+
+def test_ctrl_c_says_how_to_resume_and_exits_with_130(tmp_path):
+    out, suite = tmp_path / "run", tmp_path / "long.toml"
+    suite.write_text('envs = ["quad/HelixTracking-v0"]\npolicies = ["random", "hover"]\nepisodes = 2000\n')
+    command = [*RUN, "benchmark", str(suite), "--out", str(out)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        for _ in range(600):
+            if list(out.glob("cells/*.json")):
+                break
+            time.sleep(0.05)
+        os.kill(process.pid, signal.SIGINT)
+        printed, said = process.communicate(timeout=30)
+    assert process.returncode == 130 and printed == "" and "Traceback" not in said
+    assert f"1 units are stored. Resume with: quad-envs benchmark {suite} --out {out}" in said
+    assert not (out / ".lock").exists() and not (out / "results.csv").exists()
+
+
+def test_doctor_examines_the_installation(capsys):
+    assert main(["doctor", "--json"]) == 0
+    findings = {finding["check"]: finding for finding in json.loads(capsys.readouterr().out)}
+    assert set(findings) == {"versions", "packages", "cache", "self-test", "extras"}
+    assert all(finding["ok"] for finding in findings.values())
+
+
+def test_doctor_names_a_package_of_the_same_name(monkeypatch):
+    from baselines import doctor
+
+    monkeypatch.setattr(
+        doctor.metadata, "packages_distributions", lambda: {"controllers": ["quad-envs", "webapp"]}
+    )
+    finding = doctor._shadowing()
+    assert not finding.ok and "webapp also installs a package controllers" in finding.detail
