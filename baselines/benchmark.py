@@ -144,8 +144,8 @@ def _begin(folder: Path | None, suite: Suite, units: Sequence[Unit]) -> dict[int
         )
     if stored.get("source") != source_digest():
         raise ResultsError(
-            f"{str(folder)!r} was begun with other sources, of revision {stored.get('git_revision')}: their numbers "
-            "do not mix; choose another folder, or discard it with fresh=True (--fresh)"
+            f"{str(folder)!r} was begun with other sources, revision {stored.get('git_revision')}: their "
+            "numbers do not mix; choose another folder, or discard it with fresh=True (--fresh)"
         )
     return dict(_stored_units(folder, units))
 
