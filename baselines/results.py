@@ -20,7 +20,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -55,10 +55,8 @@ def write_atomic(path: Path, data: bytes) -> None:
             "free it and start again: finished units are kept"
         ) from error
     finally:
-        try:
+        with suppress(OSError):  # the folder itself is not usable, which the error above says
             temporary.unlink(missing_ok=True)
-        except OSError:
-            pass  # the folder itself is not usable, which the error above says
 
 
 def plain_json(value: Any) -> Any:

@@ -165,7 +165,7 @@ def _vector_episodes(policy: Policy, env: Any, episodes: int, seed: int) -> Iter
     for first in range(0, episodes, n):
         seeds = [seed + first + j for j in range(n)]
         observations, _ = env.reset(seed=seeds)
-        recorder = _Recorder(plain.task, seeds, _references(plain))
+        recorder = _Recorder(plain.task, seeds, plain.reference)
         recorder.plants.append(plain.state)
         wanted = min(n, episodes - first)
         state, start = None, np.ones(n, dtype=np.bool_)
@@ -238,11 +238,3 @@ def _warm_up(policy: Policy, observations: NDArray[Any]) -> None:
     for _ in range(_WARM_UP_CALLS):
         _, state = policy.predict(observations, state, start, deterministic=True)
         start = np.zeros(len(observations), dtype=np.bool_)
-
-
-def _references(plain: Any) -> Array:
-    """Copies of this round's reference tables, (n, steps, 8)."""
-    if hasattr(plain, "reference"):
-        return np.array(plain.reference)
-    tables = plain._batch.references  # one for all rows where it is not random
-    return np.array(np.broadcast_to(tables, (plain.num_envs, *tables.shape[1:])))
