@@ -68,40 +68,31 @@ class Results:
         return "\n\n".join(self._table(env) for env in self.suite.envs)
 
     def _table(self, env: EnvChoice) -> str:
-        base = self.suite.base
-        header = [
-            "policy",
-            "score",
-            f"- {base}",
-            "+-",
-            "cost",
-            "RMS m",
-            "steady m",
-            "effort N^2",
-            "violating %",
-        ]
-        header += ["worst", "crashes", "saturated %", "p50 ms", "p99 ms", "fallbacks"]
+        rows = [row for row in self.summary() if row["env"] == env.title]
+        limits = [key for key in rows[0] if key.startswith("worst_")]  # differ in unit, so never merged
+        header = ["policy", "score", f"- {self.suite.base}", "+-", "cost", "RMS m", "steady m", "effort N^2"]
+        header += ["violating %", *(key.replace("_", " ") for key in limits)]
+        header += ["crashes", "saturated %", "p50 ms", "p99 ms", "fallbacks"]
         lines = []
-        for row in (row for row in self.summary() if row["env"] == env.title):
-            worst = max(
-                (value for key, value in row.items() if key.startswith("worst_")), default=float("nan")
-            )
-            numbers = [row["score"], row["score_minus_base"], row["score_minus_base_ci"], row["cost"]]
-            numbers += [
-                row["position_rms"],
-                row["steady_rms"],
-                row["effort"],
+        for row in rows:
+            columns = [
+                "score",
+                "score_minus_base",
+                "score_minus_base_ci",
+                "cost",
+                "position_rms",
+                "steady_rms",
+                "effort",
+            ]
+            numbers = [
+                *(row[name] for name in columns),
                 100.0 * row["violation_share"],
-                worst,
+                *(row[key] for key in limits),
             ]
             failed = sum(row[name] for name in ("relaxed", "previous_plan", "clipped_sdre", "hover"))
+            times = row["decision_p50_ms"], row["decision_p99_ms"]
             cells = [row["policy"], *map(format_number, numbers), str(row["crashed"])]
-            cells += [format_number(100.0 * row["saturation_share"])]
-            cells += [
-                format_number(row["decision_p50_ms"]),
-                format_number(row["decision_p99_ms"]),
-                str(failed),
-            ]
+            cells += [*map(format_number, (100.0 * row["saturation_share"], *times)), str(failed)]
             lines.append(cells)
         seeds = f"seeds {self.suite.seed} to {self.suite.seed + self.suite.episodes - 1}"
         return f"{env.title}, {seeds}\n{format_table(header, lines)}"

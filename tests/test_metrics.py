@@ -112,6 +112,7 @@ def test_the_worst_violation_of_each_constraint_is_its_largest_excess():
     task = Task(limits=Limits(tilt=0.3, rate=10.0))
     values = np.full((STEPS, 2), -0.1)
     values[7, 1] = 0.25
+    values[8, 0] = 1e-7  # less than what the environments call a violation
     record = measure(flight(task, constraint_values=values))
     assert record.worst_violation == {"tilt": 0.0, "rate": 0.25}
     assert record.row()["worst_rate"] == 0.25
