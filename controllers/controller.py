@@ -29,20 +29,25 @@ class Decision(NamedTuple):
 
 
 class Controller(Protocol):
-    """A feedback law over a batch of vehicles; rows are independent and nothing is remembered but `memory`."""
+    """A feedback law over a batch of vehicles; rows are independent, and only `memory` is remembered."""
 
     horizon: int  # stages of the reference window after the present one
     memory_size: int  # numbers that travel from sample to sample
 
     def decide(
-        self, plant: ArrayLike, window: ArrayLike, last_command: ArrayLike, disturbance: ArrayLike, memory: ArrayLike
+        self,
+        plant: ArrayLike,
+        window: ArrayLike,
+        last_command: ArrayLike,
+        disturbance: ArrayLike,
+        memory: ArrayLike,
     ) -> Decision:
         """One command per vehicle.
 
         Args:
             plant: Measured [p, V_B, Theta, Omega, F], (n, 16).
-            window: Reference from now on, (n, >= horizon + 1, 8): p_ref, v_ref (inertial), sin and cos of psi_ref;
-                positions in the frame of p.
+            window: Reference from now on, (n, >= horizon + 1, 8): p_ref, v_ref (inertial), sin and cos of
+                psi_ref; positions in the frame of p.
             last_command: Last applied rotor commands, (n, 4), N.
             disturbance: Torque in body axes, N m, and force in inertial axes, N, as far as revealed, (n, 6).
             memory: Of the previous decision, (n, memory_size); zeros for a vehicle that starts.

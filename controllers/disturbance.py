@@ -1,8 +1,8 @@
 """Disturbances: what cancels them, and an estimator where they are not revealed (offset-free MPC).
 
-A disturbance is six numbers, torque in body axes (N m) and force in inertial axes (N). The rotors cancel the torques
-and the vertical force directly ("feedforward cancellation", section 4.7 of the dissertation); a lateral force needs a
-trim attitude, which becomes part of the reference.
+A disturbance is six numbers, torque in body axes (N m) and force in inertial axes (N). The rotors cancel the
+torques and the vertical force directly ("feedforward cancellation", section 4.7 of the dissertation); a
+lateral force needs a trim attitude, which becomes part of the reference.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 from quad_envs._numba import kernel
-from quad_envs.dynamics import advance, load_vehicle, store_vehicle
+from quad_envs.dynamics import SCRATCH_ROWS, advance, load_vehicle, store_vehicle
 from quad_envs.parameters import (
     GRAVITY,
     HOVER_FORCE,
@@ -30,11 +30,16 @@ from .ocp import IntArray
 
 N_DISTURBANCE = 6
 PLANT_SIZE = 16
-ESTIMATOR_GAIN = 0.5  # per sample: half of what is new is noise
+ESTIMATOR_GAIN = 0.5  # per sample: less is too slow for the dissertation's torque pulse, more passes noise on
 ESTIMATOR_SIZE = 1 + 2 * N_DISTURBANCE + PLANT_SIZE + N_INPUT  # see `update_estimate`
 _PLANT = 1 + 2 * N_DISTURBANCE
 _COMMAND = _PLANT + PLANT_SIZE
 _SUBSTEPS = 2  # of the prediction: 3e-5 from the limit
+_ROWS = 2 * _SUBSTEPS + 1  # of the disturbance table that the prediction reads
+_TABLE = PLANT_SIZE + N_DISTURBANCE
+ESTIMATOR_SCRATCH = _TABLE + _ROWS * N_DISTURBANCE + SCRATCH_ROWS
+_TORQUE_SHARE = 0.25  # of L m g / 2, the roll torque available in hover, that an estimate may reach
+_FORCE_SHARE = 0.5  # of the weight, likewise
 _SMALLEST_LIFT = 0.1  # of the weight, that the thrust carries when a force lifts the vehicle
 _YAW_SHARE = 0.5  # of the rotor force range around hover that may go into cancelling a yaw torque
 
@@ -43,8 +48,9 @@ _YAW_SHARE = 0.5  # of the rotor force range around hover that may go into cance
 def feed_forward(d: Array, psi: float, c: Array, force_max: float, offset: Array, trim: Array) -> None:
     """Rotor forces and attitude at which the vehicle stands still under a constant disturbance.
 
-    With f = d_force / m in axes turned by psi, thrust and attitude satisfy T/m R_BI'e3 = g e3 + f. The yaw torque of the
-    rotors is weak (hover allows 0.017 N m), so its part is clipped, and the rest left to the feedback.
+    With f = d_force / m in axes turned by psi, thrust and attitude satisfy T/m R_BI'e3 = g e3 + f. The yaw
+    torque of the rotors is weak (hover allows 0.017 N m), so its part is clipped, and the rest left to the
+    feedback.
 
     Args:
         d: Disturbance, (6,).
@@ -111,41 +117,48 @@ def update_estimate(
     scratch: Array,
     which: IntArray,
 ) -> None:
-    """Low-passed difference between the measured plant and the one-step prediction by the full model with rotor lag.
+    """Correct the estimate by what a one-step prediction of the full model, with rotor lag, did not explain.
 
-    Only velocities and rates are compared, so positions may be relative. What was revealed over the past period is
-    taken off. A difference beyond half of what the rotors could cancel is clipped: one glitch must not tumble the
-    vehicle.
+    The prediction is made under the disturbance that was assumed, so that a constant one is found exactly.
+    Only velocities and rates are compared: positions may be relative. The estimate is limited to a share of
+    what the rotors can cancel: a disturbance that turns faster than it can be estimated must not saturate
+    them.
 
     Args:
         plant: Measured [p, V_B, Theta, Omega, F], (16,).
-        memory: As `remember` left it, (ESTIMATOR_SIZE,): whether it holds a sample, the estimate, the disturbance
-            revealed then, plant and command then.
-        gain: Share of the new residual, in (0, 1].
+        memory: As `remember` left it, (ESTIMATOR_SIZE,): whether it holds a sample, the estimate, the
+            disturbance revealed then, plant and command then.
+        gain: Share of each correction, in (0, 1].
         c: QuadrotorParams.coefficients().
         dt: Control period, s.
         force_max: Largest rotor force, N.
         estimate: Result, (6,).
-        scratch: Overwritten, (>= SCRATCH_ROWS + 22,).
+        scratch: Overwritten, (ESTIMATOR_SCRATCH,).
         which: Zeros, (1,).
     """
     for i in range(N_DISTURBANCE):
         estimate[i] = memory[1 + i]
     if memory[0] == 0.0:
         return
-    predicted, measured, w = scratch[:16], scratch[16:22], scratch[22:]
+    predicted, correction, rest = scratch[:PLANT_SIZE], scratch[PLANT_SIZE:_TABLE], scratch[_TABLE:]
+    table, w = (
+        rest[: _ROWS * N_DISTURBANCE].reshape(1, 1, _ROWS, N_DISTURBANCE),
+        rest[_ROWS * N_DISTURBANCE :],
+    )
     for i in range(PLANT_SIZE):
         predicted[i] = memory[_PLANT + i]
+    for k in range(_ROWS):
+        for i in range(N_DISTURBANCE):
+            table[0, 0, k, i] = memory[1 + i] + memory[1 + N_DISTURBANCE + i]
     load_vehicle(w, 0, 1, predicted, memory[_COMMAND:], force_max, c, dt / _SUBSTEPS)
-    advance(w, 1, 1, _SUBSTEPS, dt / _SUBSTEPS, w[:0].reshape(1, 0, 1, N_DISTURBANCE), which, which)
-    if not (store_vehicle(w, 0, 1, predicted) and _residual(plant, predicted, dt, c, measured)):
+    advance(w, 1, 1, _SUBSTEPS, dt / _SUBSTEPS, table, which, which)
+    if not (store_vehicle(w, 0, 1, predicted) and _residual(plant, predicted, dt, c, correction)):
         return
     weight = 4.0 * c[HOVER_FORCE]
     arm = c[ROLL_GAIN] / c[INV_JX]
     for i in range(N_DISTURBANCE):
-        limit = 0.5 * (arm * weight if i < 3 else weight)
-        new = min(max(measured[i] - memory[1 + N_DISTURBANCE + i], -limit), limit)
-        estimate[i] += gain * (new - estimate[i])
+        limit = _FORCE_SHARE * weight if i >= 3 else _TORQUE_SHARE * 0.5 * arm * weight
+        estimate[i] = min(max(estimate[i] + gain * correction[i], -limit), limit)
 
 
 @kernel

@@ -1,7 +1,7 @@
-"""What a controller does when its quadratic program has no answer; section 9 of the solver chapter of the design.
+"""What a controller does when its quadratic program has no answer.
 
-A failure is a value, never an exception: each decision says how it was found, and its command is always finite and
-inside the rotor box.
+A failure is a value, never an exception: each decision says how it was found, and its command is always
+finite and inside the rotor box.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ RELAXED_WEIGHT = 1e4  # exact penalty per unit of a row that was hard
 
 @kernel
 def limit_command(F: Array, last: Array, rate_step: float, force_max: float, out: Array) -> None:
-    """Bring a command to within one rate step of the last one where the box allows it, and always into the box.
+    """Bring a command to within one rate step of the last one where the box allows it, always into the box.
 
     Args:
         F: Wanted rotor commands, (4,), N; an entry that is not finite becomes the last command.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from quad_envs._numba import kernel
@@ -61,16 +63,17 @@ class LinearMPC(Mpc):
     """MPC on the hover linearisation, with the solution of its Riccati equation as terminal weight.
 
     Deviation:
-        With frame "heading" (default) the problem is posed at the present position and heading, so that yaw may be
-        anything; "hover" is the dissertation's: the model belongs to psi = 0, v_ref stands in the slot of V_B in
-        inertial axes, and the yaw error is not wrapped.
+        With frame "heading" (default) the problem is posed at the present position and heading, so that yaw
+        may be anything; "hover" is the dissertation's: the model belongs to psi = 0, v_ref stands in the slot
+        of V_B in inertial axes, and the yaw error is not wrapped.
 
     Args:
         task: What is known of the flight.
         horizon: N, samples.
         solver: "structured" (exact, one compiled call) or "osqp".
         frame: "heading" or "hover".
-        velocity_reference: Axes in which v_ref is compared with V_B: "heading", or "attitude" for the present body axes.
+        velocity_reference: How v_ref is turned before it is compared with V_B, in frame "heading": by the
+            present "heading", or by the whole present "attitude", which costs up to 3 times less here.
         soft_weight: Exact penalty per unit of a state row; inf makes the rows hard.
         reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
         estimator_gain: Share of each new residual in the estimate, in (0, 1].
@@ -87,22 +90,29 @@ class LinearMPC(Mpc):
         *,
         solver: SolverName = "structured",
         frame: Frame = "heading",
-        velocity_reference: VelocityReference = "heading",
+        velocity_reference: VelocityReference = "attitude",
         soft_weight: float = 1e3,
         reject_disturbance: bool = False,
         estimator_gain: float = ESTIMATOR_GAIN,
         iteration_limit: int = ITERATION_LIMIT,
     ) -> None:
         options = MpcOptions(
-            solver, frame, velocity_reference, soft_weight, reject_disturbance, estimator_gain, iteration_limit
+            solver,
+            frame,
+            velocity_reference,
+            soft_weight,
+            reject_disturbance,
+            estimator_gain,
+            iteration_limit,
         )
         super().__init__(task, horizon, options, pairs=1, guess=False)
         A, B = hover_pair(task.params, task.dt)
         self._A, self._B = np.ascontiguousarray(A[None]), np.ascontiguousarray(B[None])
 
-    def _decide_rows(self, *arrays: Array) -> int:
+    def _decide_rows(self, *arrays: Any) -> int:
         which, buffer, ws = self._scratch()
-        return _decide_rows(*arrays, which, self._A, self._B, self._data, buffer, ws)
+        arguments: tuple[Any, ...] = (*arrays, which, self._A, self._B, self._data, buffer, ws)
+        return _decide_rows(*arguments)
 
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
         _hold_trim_everywhere(self._A, s)

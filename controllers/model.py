@@ -50,7 +50,7 @@ def _cosine_less_one_over_angle(angle: float) -> float:
 
 
 @inline_kernel
-def _set_euler_rates(sf, cf, st, ct, out):  # type: ignore[no-untyped-def]
+def _set_euler_rates(sf: float, cf: float, st: float, ct: float, out: Array) -> None:
     """Block (Theta, Omega) = W."""
     bounded = max(ct, _SMALLEST_COSINE) if ct >= 0.0 else min(ct, -_SMALLEST_COSINE)
     out[6, 9], out[6, 10], out[6, 11] = 1.0, sf * st / bounded, cf * st / bounded
@@ -59,7 +59,7 @@ def _set_euler_rates(sf, cf, st, ct, out):  # type: ignore[no-untyped-def]
 
 
 @inline_kernel
-def _set_rotation(sf, cf, st, ct, ss, cs, out):  # type: ignore[no-untyped-def]
+def _set_rotation(sf: float, cf: float, st: float, ct: float, ss: float, cs: float, out: Array) -> None:
     """Block (p, V_B) = R_BI'."""
     out[0, 3], out[0, 4], out[0, 5] = ct * cs, st * cs * sf - ss * cf, st * cs * cf + ss * sf
     out[1, 3], out[1, 4], out[1, 5] = ct * ss, st * ss * sf + cs * cf, st * ss * cf - cs * sf
@@ -70,11 +70,12 @@ def _set_rotation(sf, cf, st, ct, ss, cs, out):  # type: ignore[no-untyped-def]
 def sdc_matrix(x: Array, alpha: float, c: Array, out: Array) -> None:
     """A_c(x) with A_c(x) x + B_c (F - u_T) = f(x, F) exactly, for every alpha; Eqs. (4.5), (4.6).
 
-    -Omega x V_B is split as -(1 - alpha) [Omega]x V_B + alpha [V_B]x Omega; alpha = 1/2 is the dissertation's choice.
+    -Omega x V_B is split as -(1 - alpha) [Omega]x V_B + alpha [V_B]x Omega; alpha = 1/2 is the dissertation's
+    choice.
 
     Deviation:
-        sin a / a and (cos a - 1) / a are evaluated exactly instead of by the Taylor polynomials of 4.7, and W with
-        |cos theta| >= 0.01, so that the matrix stays finite at |theta| = pi/2.
+        sin a / a and (cos a - 1) / a are evaluated exactly instead of by the Taylor polynomials of 4.7, and W
+        with |cos theta| >= 0.01, so that the matrix stays finite at |theta| = pi/2.
 
     Args:
         x: State, (12,).
@@ -108,7 +109,9 @@ def sdc_matrix(x: Array, alpha: float, c: Array, out: Array) -> None:
 
 
 @inline_kernel
-def rotated_derivatives(sf, cf, st, ct, ss, cs, a0, a1, a2):  # type: ignore[no-untyped-def]
+def rotated_derivatives(
+    sf: float, cf: float, st: float, ct: float, ss: float, cs: float, a0: float, a1: float, a2: float
+) -> tuple[float, ...]:
     """Derivative of R_BI(Theta) a by (phi, theta, psi), for an inertial vector a.
 
     Returns:
@@ -128,12 +131,13 @@ def rotated_derivatives(sf, cf, st, ct, ss, cs, a0, a1, a2):  # type: ignore[no-
 
 
 @kernel
-def jacobian(x, d, c, out):  # type: ignore[no-untyped-def]
+def jacobian(x: Array, d: Array, c: Array, out: Array) -> None:
     """df/dx of `rigid_body`, exact.
 
     Args:
         x: State, (12,), |theta| < pi/2.
-        d: Disturbance, (6,): torque in body axes, N m, and force in inertial axes, N, as `rigid_body` takes it.
+        d: Disturbance, (6,): torque in body axes, N m, and force in inertial axes, N, as `rigid_body` takes
+            it.
         c: QuadrotorParams.coefficients().
         out: Result, (12, 12).
     """
@@ -189,10 +193,11 @@ def _horner_step(X: Array, S: Array, factor: float, out: Array) -> None:
 
 @kernel
 def zero_order_hold(A_c: Array, B_c: Array, dt: float, A: Array, B: Array, scratch: Array) -> None:
-    """Exact discretisation for an input held over dt: A = exp(A_c dt), B = int_0^dt exp(A_c s) ds B_c; Eq. (4.8).
+    """Exact discretisation for a held input, Eq. (4.8): A = exp(A_c dt), B = int_0^dt exp(A_c s) ds B_c.
 
-    Horner's scheme for Psi = sum_k X^k / (k+1)!, X = A_c h; A = I + X Psi, B = h Psi B_c; h is dt halved until
-    |X| <= 1.2, and then doubled again by S(2h) = S(h) + Phi(h) S(h) for S = h Psi, and Phi(2h) = Phi(h)^2.
+    Horner's scheme for Psi = sum_k X^k / (k+1)!, X = A_c h; A = I + X Psi, B = h Psi B_c; h is dt halved
+    until |X| <= 1.2, and then doubled again by S(2h) = S(h) + Phi(h) S(h) for S = h Psi, and Phi(2h) =
+    Phi(h)^2.
 
     Args:
         A_c: Continuous state matrix, (12, 12).
@@ -255,7 +260,18 @@ def _sensitivity_slope(J: Array, V: Array, B_c: Array, out: Array) -> None:
 
 
 @kernel
-def rk4_sensitivities(x, F, d, c, B_c, h, x_next, A, B, scratch):  # type: ignore[no-untyped-def]
+def rk4_sensitivities(
+    x: Array,
+    F: Array,
+    d: Array,
+    c: Array,
+    B_c: Array,
+    h: float,
+    x_next: Array,
+    A: Array,
+    B: Array,
+    scratch: Array,
+) -> None:
     """One RK4 step of the exact 12-state model without rotor lag, with its derivatives.
 
     Args:
@@ -280,7 +296,7 @@ def rk4_sensitivities(x, F, d, c, B_c, h, x_next, A, B, scratch):  # type: ignor
             V_total[i, j] = 0.0
         V[i, i] = 1.0
     for stage in range(4):
-        k = rigid_body(y, F, d, c)
+        k = rigid_body(y, F, d, c)  # type: ignore[arg-type]
         jacobian(y, d, c, J)
         _sensitivity_slope(J, V, B_c, slope)
         weight = h / 6.0 if stage == 0 or stage == 3 else h / 3.0

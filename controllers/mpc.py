@@ -119,7 +119,7 @@ def _mpc_data(task: Task, horizon: int, options: MpcOptions) -> MpcData:
         rate_step=float(task.limits.rate * task.dt),
         gain=float(options.estimator_gain) if options.reject_disturbance else 0.0,
         heading=options.frame == "heading",
-        attitude=options.velocity_reference == "attitude",
+        attitude=options.frame == "heading" and options.velocity_reference == "attitude",
         iteration_limit=int(options.iteration_limit),
     )
 
@@ -145,12 +145,21 @@ class Mpc(ABC):
         self._backend: Backend | None = None
 
     def decide(
-        self, plant: ArrayLike, window: ArrayLike, last_command: ArrayLike, disturbance: ArrayLike, memory: ArrayLike
+        self,
+        plant: ArrayLike,
+        window: ArrayLike,
+        last_command: ArrayLike,
+        disturbance: ArrayLike,
+        memory: ArrayLike,
     ) -> Decision:
         """One command per vehicle; see `Controller.decide`."""
         arrays = as_rows(plant, window, last_command, disturbance, memory, self.horizon + 1, self.memory_size)
         n = arrays[0].shape[0]
-        command, kept, report = np.empty((n, N_INPUT)), np.empty((n, self.memory_size)), np.empty((2, n), np.int64)
+        command, kept, report = (
+            np.empty((n, N_INPUT)),
+            np.empty((n, self.memory_size)),
+            np.empty((2, n), np.int64),
+        )
         if self.options.solver == "structured":
             bad = self._decide_rows(*arrays, command, kept, report)
         else:
@@ -171,7 +180,7 @@ class Mpc(ABC):
         """Take the plan in ws after pass `number`; whether it is the last one."""
         return True
 
-    def _keep(self, level: int, kept: Array, s: Scratch) -> None:
+    def _keep(self, level: int, kept: Array, s: Scratch) -> None:  # noqa: B027  most flavours keep nothing
         """Write what the flavour remembers."""
 
     def _scratch(self) -> tuple[IntArray, Array, Workspace]:
@@ -206,7 +215,18 @@ class Mpc(ABC):
                 iterations += count
                 done = level > RELAXED or self._accept(number, s, ws)
                 number += 1
-            end_row(level, plants[j], lasts[j], disturbances[j], memories[j], self._data, s, ws.u, commands[j], kept[j])
+            end_row(
+                level,
+                plants[j],
+                lasts[j],
+                disturbances[j],
+                memories[j],
+                self._data,
+                s,
+                ws.u,
+                commands[j],
+                kept[j],
+            )
             self._keep(level, kept[j], s)
             report[:, j] = level, iterations
         return -1

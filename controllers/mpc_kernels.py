@@ -1,9 +1,9 @@
-"""One sample of an MPC in compiled form: frame, reference, bounds and rows before the solve, fallbacks, command after it.
+"""One sample of an MPC in compiled form: what comes before the solve, the fallbacks, and what comes after it.
 
 The flavours (`lmpc.py`, `sdc_nmpc.py`, `nmpc.py`) add how the pairs (A_i, B_i) and affine terms c_i are made.
 
-Memory of one vehicle: whether a plan is held, the plan's rotor commands (N x 4), then, with `reject_disturbance`, the
-estimator's ESTIMATOR_SIZE numbers, then what the flavour keeps.
+Memory of one vehicle: whether a plan is held, the plan's rotor commands (N x 4), then, with
+`reject_disturbance`, the estimator's ESTIMATOR_SIZE numbers, then what the flavour keeps.
 """
 
 from __future__ import annotations
@@ -12,18 +12,15 @@ import math
 from typing import NamedTuple
 
 from quad_envs._numba import kernel
-from quad_envs.dynamics import SCRATCH_ROWS
 from quad_envs.parameters import HOVER_FORCE, N_INPUT, N_STATE, Array
 from quad_envs.rotations import sincos, wrap_angle_scalar
 
-from .disturbance import N_DISTURBANCE, feed_forward, remember, update_estimate
+from .disturbance import ESTIMATOR_SCRATCH, N_DISTURBANCE, feed_forward, remember, update_estimate
 from .fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXED_WEIGHT, limit_command
 from .ocp import IntArray
 from .riccati import DARE_SCRATCH
 from .solvers.active_set import INFEASIBLE, OPTIMAL
 from .solvers.structured import Workspace, solve_structured
-
-_WORK = 22 + SCRATCH_ROWS  # of `update_estimate`
 
 
 class MpcData(NamedTuple):
@@ -72,7 +69,7 @@ class Scratch(NamedTuple):
     A_c: Array  # (12, 12)
     P: Array  # (12, 12)
     square: Array  # (DARE_SCRATCH, 12, 12)
-    work: Array  # (_WORK,)
+    work: Array  # (ESTIMATOR_SCRATCH,)
     Q: Array  # (M, 12, 12), stage weights; M = N where a guess is kept, else 0
     target: Array  # (M+1, 12), references that go with them
     X: Array  # (M+1, 12), guess of the states
@@ -82,7 +79,7 @@ class Scratch(NamedTuple):
 def buffer_size(N: int, pairs: int, H: int, K: int, M: int) -> int:
     """Numbers that `carve` needs."""
     n, m = N_STATE, N_INPUT
-    vectors = 2 * n + 4 * m + 2 * N_DISTURBANCE + _WORK
+    vectors = 2 * n + 4 * m + 2 * N_DISTURBANCE + ESTIMATOR_SCRATCH
     stages = n * (2 * N + 1) + pairs * n * (n + m) + n * H + 3 * K
     return vectors + stages + (2 + DARE_SCRATCH) * n * n + M * n * n + 2 * n * (M + 1) + m * M
 
@@ -97,7 +94,7 @@ def _take(buffer: Array, start: int, rows: int, columns: int) -> Array:
 def carve(buffer: Array, N: int, pairs: int, H: int, K: int, M: int) -> Scratch:
     """Views of the buffer; one array is unpacked at the call from Python instead of two dozen."""
     n, m, e = N_STATE, N_INPUT, N_DISTURBANCE
-    v = _take(buffer, 0, 1, 2 * n + 4 * m + 2 * e + _WORK)[0]
+    v = _take(buffer, 0, 1, 2 * n + 4 * m + 2 * e + ESTIMATOR_SCRATCH)[0]
     i = v.shape[0]
     r = _take(buffer, i, N + 1, n)
     i += r.size
@@ -138,14 +135,12 @@ def set_state(plant: Array, heading: bool, x_0: Array) -> None:
 
 
 @kernel
-def set_references(
-    plant: Array, window: Array, trim: Array, heading: bool, attitude: bool, r: Array
-) -> None:
+def set_references(plant: Array, window: Array, trim: Array, heading: bool, attitude: bool, r: Array) -> None:
     """Rows r_i = [p_ref; v_ref; trim phi, theta; psi_ref; 0] in the frame of the problem.
 
-    The slot of V_B holds v_ref turned by the present heading, or by the whole present attitude, or (frame "hover",
-    as in the dissertation) as it stands in inertial axes. psi_ref goes on continuously from row to row; the first
-    is the one nearest to psi with `heading`, and in (-pi, pi] without.
+    The slot of V_B holds v_ref turned by the present heading, or by the whole present attitude, or (frame
+    "hover", as in the dissertation) as it stands in inertial axes. psi_ref goes on continuously from row to
+    row; the first is the one nearest to psi with `heading`, and in (-pi, pi] without.
 
     Args:
         plant: Measured, (16,).
@@ -172,7 +167,11 @@ def set_references(
         elif window[i, 6] != window[i - 1, 6] or window[i, 7] != window[i - 1, 7]:
             turn_sine = window[i, 6] * window[i - 1, 7] - window[i, 7] * window[i - 1, 6]
             turn_cosine = window[i, 7] * window[i - 1, 7] + window[i, 6] * window[i - 1, 6]
-            yaw = yaw + math.atan2(turn_sine, turn_cosine) if heading else math.atan2(window[i, 6], window[i, 7])
+            yaw = (
+                yaw + math.atan2(turn_sine, turn_cosine)
+                if heading
+                else math.atan2(window[i, 6], window[i, 7])
+            )
         x, y, z = window[i, 0], window[i, 1], window[i, 2]
         if heading:
             x, y, z = x - plant[0], y - plant[1], z - plant[2]
@@ -211,9 +210,16 @@ def set_rows(plant: Array, data: MpcData, s: Scratch) -> None:
 
 @kernel
 def begin_row(
-    plant: Array, window: Array, last: Array, revealed: Array, memory: Array, which: IntArray, data: MpcData, s: Scratch
+    plant: Array,
+    window: Array,
+    last: Array,
+    revealed: Array,
+    memory: Array,
+    which: IntArray,
+    data: MpcData,
+    s: Scratch,
 ) -> None:
-    """Everything of one sample's problem but the model: disturbance, equilibrium, state, reference, bounds, rows."""
+    """One sample's problem but for the model: disturbance, equilibrium, state, reference, bounds, rows."""
     s.estimate[:] = 0.0
     if data.gain > 0.0:
         kept = memory[1 + N_INPUT * s.c.shape[0] :]
@@ -263,7 +269,7 @@ def solve_row(
     s: Scratch,
     ws: Workspace,
 ) -> tuple[int, int]:
-    """Solve with fallbacks: hard rows that contradict each other become soft; without a plan, no constraints at all.
+    """Solve; hard rows that contradict each other become soft; failing that, without a plan, no constraints.
 
     Returns:
         Fallback (PREVIOUS_PLAN and HOVER leave no plan in ws.u), and active-set iterations.

@@ -1,13 +1,13 @@
-"""Exact nonlinear MPC: real-time iteration or SQP to convergence on the structured QP; not in the dissertation.
+"""Exact nonlinear MPC by real-time iteration or SQP to convergence; not in the dissertation.
 
-Multiple shooting: about a guess (X, F) one RK4 step per sample gives A_i, B_i and c_i = phi(X_i, F_i) - A_i X_i - B_i u_i;
-the QP's plan is the next guess. The cost is quadratic in a residual e(x), so Gauss-Newton is the whole Hessian but for
-second derivatives of e.
+Multiple shooting: about a guess (X, F) one RK4 step per sample gives A_i, B_i and c_i = phi(X_i, F_i) - A_i
+X_i - B_i u_i; the QP's plan is the next guess. The cost is quadratic in a residual e(x); Gauss-Newton leaves
+out the second derivatives of e.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from quad_envs._numba import kernel
 from quad_envs.parameters import N_INPUT, N_STATE, Array
@@ -138,7 +138,8 @@ def gauss_newton_weight(Q: Array, D: Array, out: Array) -> None:
 def linearise_cost(inertial: bool, data: MpcData, s: Scratch) -> None:
     """Stage weights Q_i = E_i'Q E_i and references X_i - E_i^-1 e(X_i) about the guess.
 
-    The residual is that of the reward: e = [p - p_ref; V_B - R_BI(Theta) v_ref; Theta - Theta_ref; Omega], yaw wrapped.
+    The residual is that of the reward, e = [p - p_ref; V_B - R_BI(Theta) v_ref; Theta - Theta_ref; Omega]
+    with the yaw error wrapped; without `inertial`, v_ref is not turned.
     """
     N = s.F.shape[0]
     D = s.square[9, 2:5, :3]
@@ -230,8 +231,8 @@ class ExactNmpc(Mpc):
     Args:
         task: What is known of the flight.
         horizon: N, samples.
-        passes: 1: real-time iteration, one QP per sample about the shifted solution; more: SQP until no input changes
-            by 1e-6 N, 30 is ample.
+        passes: 1: real-time iteration, one QP per sample about the shifted solution; more: SQP until no input
+            changes by 1e-6 N, 30 is ample.
         velocity_error: "inertial": V_B - R_BI(Theta) v_ref with the predicted attitude, as the reward has it;
             "body": V_B - v_ref, v_ref turned by the present heading (frame "heading") or not (frame "hover").
         solver: See `LinearMPC`, as the options that follow.
@@ -269,10 +270,12 @@ class ExactNmpc(Mpc):
         self.passes = int(passes)
         self.velocity_error = velocity_error
 
-    def _decide_rows(self, *arrays: Array) -> int:
+    def _decide_rows(self, *arrays: Any) -> int:
         which, buffer, ws = self._scratch()
         inertial = self.velocity_error == "inertial"
-        return _decide_rows(*arrays, which, self.passes, inertial, self._keep_from, self._data, buffer, ws)
+        constants = (which, self.passes, inertial, self._keep_from, self._data, buffer, ws)
+        arguments: tuple[Any, ...] = (*arrays, *constants)
+        return _decide_rows(*arguments)
 
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
         if number == 0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from quad_envs._numba import kernel
 from quad_envs.parameters import N_STATE, Array
@@ -109,14 +109,16 @@ class SdcNmpc(Mpc):
     """MPC on x' = A_c(x) x + B_c u, exact for the present state and frozen over the horizon.
 
     Deviation:
-        alpha = 1 by default; 1/2 is the dissertation's factorisation (4.6), under which the present body rates stay
-        frozen in the prediction and go on turning V_B: it loses a climbing helix. Frames as in `LinearMPC`.
+        alpha = 1 by default; 1/2 is the dissertation's factorisation (4.6), under which the present body
+        rates stay frozen in the prediction and go on turning V_B: it loses a climbing helix. Frames as in
+        `LinearMPC`.
 
     Args:
         task: What is known of the flight.
         horizon: N, samples.
         alpha: Member of the family of factorisations, in [0, 1]; see `model.sdc_matrix`.
-        relinearisations: Further passes, each with the pairs along the plan of the pass before; 0 is the dissertation's.
+        relinearisations: Further passes, each with the pairs along the plan of the pass before; 0 is the
+            dissertation's.
         terminal_weight: "hover": P of the hover model; "sdre": P of the present pair.
         solver: See `LinearMPC`, as the options that follow.
         frame: "heading" or "hover".
@@ -147,23 +149,32 @@ class SdcNmpc(Mpc):
         iteration_limit: int = ITERATION_LIMIT,
     ) -> None:
         if not 0.0 <= alpha <= 1.0:
-            raise ValueError(f"alpha must lie in [0, 1], got {alpha!r}; 1/2 is the dissertation's, 1 recommended")
+            raise ValueError(
+                f"alpha must lie in [0, 1], got {alpha!r}; 1/2 is the dissertation's, 1 recommended"
+            )
         if relinearisations != int(relinearisations) or relinearisations < 0:
             raise ValueError(f"relinearisations must be a whole number >= 0, got {relinearisations!r}")
         require_choice("terminal_weight", terminal_weight, TerminalWeight)
         options = MpcOptions(
-            solver, frame, velocity_reference, soft_weight, reject_disturbance, estimator_gain, iteration_limit
+            solver,
+            frame,
+            velocity_reference,
+            soft_weight,
+            reject_disturbance,
+            estimator_gain,
+            iteration_limit,
         )
         super().__init__(task, horizon, options, pairs=horizon if relinearisations else 1, guess=False)
         self.alpha = float(alpha)
         self.relinearisations = int(relinearisations)
         self.terminal_weight = terminal_weight
 
-    def _decide_rows(self, *arrays: Array) -> int:
+    def _decide_rows(self, *arrays: Any) -> int:
         which, buffer, ws = self._scratch()
-        return _decide_rows(
-            *arrays, which, self.alpha, self.relinearisations, self.terminal_weight == "sdre", self._data, buffer, ws
-        )
+        sdre_weight = self.terminal_weight == "sdre"
+        constants = (which, self.alpha, self.relinearisations, sdre_weight, self._data, buffer, ws)
+        arguments: tuple[Any, ...] = (*arrays, *constants)
+        return _decide_rows(*arguments)
 
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
         stationary, pairs = False, 1
