@@ -97,6 +97,21 @@ def policy_options(name: str) -> dict[str, Any]:
     return {parameter.name: parameter.default for parameter in parameters}
 
 
+def _check_kind(name: str, option: str, value: Any, default: Any) -> None:
+    """Refuse a word for a number and the like; whether the number is allowed, the controller knows."""
+    if isinstance(default, bool):
+        kind, fits = "True or False", isinstance(value, bool | np.bool_)
+    elif isinstance(default, int | float):
+        fits = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+        kind = "a number"
+    elif isinstance(default, str):
+        kind, fits = "a name", isinstance(value, str)
+    else:
+        return
+    if not fits:
+        raise ValueError(f"{option} of policy {name!r} must be {kind}, got {value!r} (default {default!r})")
+
+
 def make_policy(name: str, env: Any, **options: Any) -> Policy:
     """A policy for a task.
 
@@ -116,6 +131,7 @@ def make_policy(name: str, env: Any, **options: Any) -> Policy:
     for option in options:
         if option not in defaults:
             raise ValueError(unknown_name(f"option of policy {name!r}:", option, defaults))
+        _check_kind(name, option, options[option], defaults[option])
     task = task_of(env)
     preview = task.layout.preview
     if "horizon" in defaults:

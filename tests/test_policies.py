@@ -70,6 +70,15 @@ def test_an_unknown_option_is_refused_with_a_suggestion():
         make_policy("lmpc", HELIX, horzon=10)
 
 
+@pytest.mark.parametrize(
+    ("option", "value", "kind"),
+    [("horizon", "x", "a number"), ("reject_disturbance", 1, "True or False"), ("solver", 3, "a name")],
+)
+def test_an_option_of_another_kind_is_refused(option, value, kind):
+    with pytest.raises(ValueError, match=f"{option} of policy 'lmpc' must be {kind}, got {value!r}"):
+        make_policy("lmpc", HELIX, **{option: value})
+
+
 def test_an_unknown_id_is_refused_with_a_suggestion():
     with pytest.raises(ValueError, match="did you mean 'quad/HelixTracking-v0'"):
         make_policy("hover", "quad/HelixTraking-v0")
