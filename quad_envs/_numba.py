@@ -1,29 +1,98 @@
-"""Compilation of kernels: decorators with the project's options, and one line when it takes time."""
+"""Compilation of kernels with numba: one option set, fast cold starts, and one line when it takes time.
+
+A kernel may be called from other kernels and from Python. Numba by itself would optimise and emit machine code for
+every kernel at every level of nesting, which made the first decision of an MPC take half a minute. Here a kernel that
+is called from another one hands over plain LLVM code; only the kernel that Python calls is optimised, as a whole, and
+cached on disk. The cache is void as soon as any source file of the suite changes, since numba itself would not notice
+a change in a kernel of another file.
+"""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
 from numba.core import event
+from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler_machinery import register_pass
+from numba.core.registry import CPUDispatcher
+from numba.core.typed_passes import NativeLowering
 
 Int = int | np.int64  # an argument that a kernel may be given as a constant, see quad_envs.dynamics
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-_PACKAGES = ("quad_envs", "controllers", "baselines", "benchmarks")
+_PACKAGES = ("quad_envs", "controllers", "baselines")
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _InnerLowering(NativeLowering):  # type: ignore[misc]
+    """Lower to LLVM code and stop there: the caller's module is optimised once everything is linked into it."""
+
+    _name = "inner_lowering"
+
+    def run_pass(self, state: Any) -> bool:
+        """Lower without optimisation or machine code."""
+        context = state.targetctx
+        state.library = context.codegen().create_library(state.func_id.func_qualname)
+        state.library._optimize_final_module = lambda: None
+        # Numba wants a callable of its own to register the kernel under. This one is never called.
+        context.get_executable = lambda library, descriptor, env: {}.popitem
+        try:
+            return bool(super().run_pass(state))
+        finally:
+            del context.get_executable
+
+
+class _InnerCompiler(CompilerBase):  # type: ignore[misc]
+    """Numba's pipeline with `_InnerLowering` in place of native lowering."""
+
+    def define_pipelines(self) -> list[Any]:
+        """The one pipeline."""
+        manager = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        manager.passes = [(_InnerLowering if step is NativeLowering else step, why) for step, why in manager.passes]
+        manager._finalized = False
+        manager.finalize()
+        return [manager]
+
+
+class _Kernel(CPUDispatcher):  # type: ignore[misc]
+    """A function compiled into the kernels that call it, and on its own when Python calls it."""
+
+    def __init__(self, function: Callable[..., Any], inline: bool) -> None:
+        options = {"nopython": True, "boundscheck": None, "error_model": "numpy", "forceinline": inline}
+        inner = {**options, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+        super().__init__(py_func=function, targetoptions=inner, pipeline_class=_InnerCompiler)
+        self._outer = numba.njit(cache=True, error_model="numpy")(function)
+        file = getattr(self._outer._cache, "_cache_file", None)
+        if file is not None and function.__module__.split(".")[0] in _PACKAGES:
+            file._source_stamp = _source_stamp()
+
+    def __call__(self, *args: Any) -> Any:
+        """Call from Python, with every argument given."""
+        return self._outer(*args)
+
+
+@cache
+def _source_stamp() -> tuple[tuple[str, float, int], ...]:
+    """Changes with every source file of the suite."""
+    root = Path(__file__).parent.parent
+    files = [path for package in _PACKAGES for path in sorted((root / package).rglob("*.py"))]
+    return tuple((str(path), path.stat().st_mtime, path.stat().st_size) for path in files)
 
 
 def kernel(function: Function) -> Function:
-    """Compile on first call, cached on disk; division follows IEEE 754. Call it with every argument given."""
-    return cast(Function, numba.njit(cache=True, error_model="numpy")(function))
+    """Compile on first call; division follows IEEE 754. Call it with every argument given."""
+    return cast(Function, _Kernel(function, inline=False))
 
 
 def inline_kernel(function: Function) -> Function:
     """As `kernel`, but LLVM always inlines it into its caller, so that loops around it vectorise."""
-    return cast(Function, numba.njit(cache=True, error_model="numpy", forceinline=True)(function))
+    return cast(Function, _Kernel(function, inline=True))
 
 
 class _Announcer(event.Listener):
@@ -34,14 +103,11 @@ class _Announcer(event.Listener):
 
     def on_start(self, event: Any) -> None:
         """A kernel was not in the cache: say so, once."""
-        module = event.data["dispatcher"].py_func.__module__
+        module = event.data["dispatcher"].py_func.__module__ or ""
         if not self.said and module.split(".")[0] in _PACKAGES:
             self.said = True
-            print(
-                "quad_envs: compiling kernels, once per installation (a few seconds) ...",
-                file=sys.stderr,
-                flush=True,
-            )
+            message = "quad_envs: compiling kernels, once per installation (a few seconds) ..."
+            print(message, file=sys.stderr, flush=True)
 
     def on_end(self, event: Any) -> None:
         """Nothing to say when it ends."""
