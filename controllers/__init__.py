@@ -1,4 +1,4 @@
-"""Control of one vehicle: linear, state-dependent and exact MPC, feedback laws, and the solvers beneath them."""
+"""Control of one vehicle: linear, state-dependent and exact MPC, feedback laws, and their solvers."""
 
 from .controller import Controller, Decision
 from .fallback import Fallback

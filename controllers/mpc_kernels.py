@@ -328,10 +328,6 @@ def end_row(
             else:
                 plan[k] = s.offset[a] + u[i, a]
     kept[0] = 1.0 if level <= PREVIOUS_PLAN else 0.0
-    if level <= RELAXED:
-        for a in range(N_INPUT):
-            command[a] = min(max(plan[a], 0.0), data.force_max)
-    else:
-        limit_command(plan, last, data.rate_step, data.force_max, command)
+    limit_command(plan, last, data.rate_step, data.force_max, command)  # also what a backend leaves over
     if data.gain > 0.0:
         remember(plant, command, revealed, s.estimate, kept[1 + N_INPUT * N :])
