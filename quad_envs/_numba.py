@@ -1,10 +1,10 @@
 """Compilation of kernels with numba: one option set, fast cold starts, and one line when it takes time.
 
-A kernel may be called from other kernels and from Python. Numba by itself would optimise and emit machine code for
-every kernel at every level of nesting, which made the first decision of an MPC take half a minute. Here a kernel that
-is called from another one hands over plain LLVM code; only the kernel that Python calls is optimised, as a whole, and
-cached on disk. The cache is void as soon as any source file of the suite changes, since numba itself would not notice
-a change in a kernel of another file.
+A kernel may be called from other kernels and from Python. Numba by itself emits machine code, wrappers
+for Python and a cache file for every kernel at every level of nesting, which doubles the time of the first
+decision of an MPC. Here a kernel that is called from another one hands over optimised LLVM code and no more;
+only the kernel that Python calls becomes machine code and is cached on disk. The cache is void as soon as any
+source file of the suite changes, since numba itself would not notice a change in a kernel of another file.
 """
 
 from __future__ import annotations
@@ -31,15 +31,14 @@ _PACKAGES = ("quad_envs", "controllers", "baselines")
 
 @register_pass(mutates_CFG=True, analysis_only=False)
 class _InnerLowering(NativeLowering):  # type: ignore[misc]
-    """Lower to LLVM code and stop there: the caller's module is optimised once everything is linked into it."""
+    """Lower to LLVM code and stop there: it becomes machine code as a part of its caller."""
 
     _name = "inner_lowering"
 
     def run_pass(self, state: Any) -> bool:
-        """Lower without optimisation or machine code."""
+        """Lower without machine code."""
         context = state.targetctx
         state.library = context.codegen().create_library(state.func_id.func_qualname)
-        state.library._optimize_final_module = lambda: None
         # Numba wants a callable of its own to register the kernel under. This one is never called.
         context.get_executable = lambda library, descriptor, env: {}.popitem
         try:
@@ -54,7 +53,9 @@ class _InnerCompiler(CompilerBase):  # type: ignore[misc]
     def define_pipelines(self) -> list[Any]:
         """The one pipeline."""
         manager = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        manager.passes = [(_InnerLowering if step is NativeLowering else step, why) for step, why in manager.passes]
+        manager.passes = [
+            (_InnerLowering if step is NativeLowering else step, why) for step, why in manager.passes
+        ]
         manager._finalized = False
         manager.finalize()
         return [manager]

@@ -129,7 +129,7 @@ class Lemniscate:
 
 @dataclass(frozen=True, slots=True)
 class Racetrack:
-    """Along the walls of a box: the curve |x/a|^n + |y/b|^n = 1 at a constant rate of its angle, rising and falling.
+    """Along the walls of a box: |x/a|^n + |y/b|^n = 1 at a constant rate of its angle, rising and falling.
 
     The higher n, the sharper the corners. The reference itself touches the planes x = +-a and y = +-b.
     """
@@ -150,6 +150,7 @@ class Racetrack:
         slope = -(r ** (n + 1)) * (np.abs(s) ** (n - 2) * s * c - np.abs(c) ** (n - 2) * c * s)
         a, b, h = self.length, self.width, self.height
         p = np.stack([a * r * c, b * r * s, h * np.sin(0.5 * w * t)], axis=1)
+        climb = 0.5 * h * np.cos(0.5 * w * t)
         climb = 0.5 * h * np.cos(0.5 * w * t)
         v = np.stack([a * (slope * c - r * s), b * (slope * s + r * c), climb], axis=1)
         return pack_rows(p, w * v)

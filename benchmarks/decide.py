@@ -1,0 +1,212 @@
+"""Decision times in closed loop: `python -m benchmarks.decide [--horizons 5 10 25 45] [--quick] [--json]`.
+
+Every controller decides through `predict` in two flights: "nominal" (a climbing helix, no constraint active)
+and "tight" (set-point jumps with 2.45 N rotors and 5 N/s, many active). All fly in turns in one run. The time
+of a decision is the smallest over the repetitions of its flight, which repeat exactly; p50, p99 and max are
+over the decisions. The closed-loop cost is the summed stage cost. DAQP and CasADi-IPOPT fly along when they
+are installed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import sys
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from .timing import machine, one_thread, quantiles
+
+one_thread()
+
+from time import perf_counter  # noqa: E402
+
+import gymnasium as gym  # noqa: E402
+import numpy as np  # noqa: E402
+
+import quad_envs  # noqa: E402
+from baselines import make_policy  # noqa: E402
+from baselines.table import format_table  # noqa: E402
+
+_JUMPS = np.array([(0.0, 0.0, 0.0), (3.0, 3.0, 3.0), (3.0, -3.0, 1.0), (-2.0, 1.0, -3.0)])
+
+
+def set_point_jumps(t: float) -> list[float]:
+    """Another set-point every 2 s; (p, v) with v = 0."""
+    return [*_JUMPS[int((t + 1e-9) // 2.0) % len(_JUMPS)], 0.0, 0.0, 0.0]
+
+
+SCENES: dict[str, dict[str, Any]] = {
+    "nominal": {
+        "reference": quad_envs.Helix(radius=2.0, rate=0.5, vertical_speed=-0.2),
+        "rate_limit": 20.0,
+        "start": (0.0, 0.0, 0.0),
+        "time_limit": 4.0,
+    },
+    "tight": {
+        "reference": quad_envs.from_function(set_point_jumps),
+        "kappa": 0.3125,
+        "rate_limit": 5.0,
+        "start": (3.0, 3.0, 3.0),
+        "time_limit": 4.0,
+    },
+}
+
+
+class Entry(NamedTuple):
+    """A controller in the comparison."""
+
+    name: str
+    make: Callable[[Any, int], Any]  # environment, horizon -> policy
+    slow: bool = False  # flown once only
+
+
+def entries(horizon: int) -> list[Entry]:
+    """Our controllers, and the peers that are installed."""
+
+    def ours(name: str, **options: Any) -> Callable[[Any, int], Any]:
+        return lambda env, N: make_policy(name, env, horizon=N, **options)
+
+    def daqp(env: Any, N: int) -> Any:
+        from .peers import DaqpSolver
+
+        policy: Any = make_policy("sdc-nmpc", env, horizon=N, solver="osqp")
+        policy.controller._backend = DaqpSolver()
+        return policy
+
+    def ipopt(env: Any, N: int) -> Any:
+        from .peers import IpoptPolicy
+
+        return IpoptPolicy(env.unwrapped.task, N)
+
+    exact = {"velocity_error": "body", "frame": "hover"}
+    found = [
+        Entry("lmpc", ours("lmpc")),
+        Entry("sdc-nmpc", ours("sdc-nmpc")),
+        Entry("sdc-nmpc, P(x)", ours("sdc-nmpc", terminal_weight="sdre")),
+        Entry("sdc-nmpc, 1 relinearisation", ours("sdc-nmpc", relinearisations=1)),
+        Entry("nmpc, RTI", ours("nmpc", **exact)),
+        Entry("nmpc, SQP", ours("nmpc", passes=30, **exact)),
+        Entry("sdc-nmpc, OSQP update", ours("sdc-nmpc", solver="osqp")),
+    ]
+    if importlib.util.find_spec("daqp"):
+        found.append(Entry("sdc-nmpc, DAQP condensed", daqp))
+    if importlib.util.find_spec("casadi") and horizon == 25:
+        found.append(Entry("nmpc, CasADi IPOPT", ipopt, slow=True))
+    return found
+
+
+class Result(NamedTuple):
+    """One controller in one scene."""
+
+    p50: float  # ms
+    p99: float
+    max: float
+    cost: float  # summed stage cost
+    fallbacks: int
+
+
+def fly_in_turns(scene: str, horizon: int, repetitions: int) -> dict[str, Result]:
+    """Fly all controllers, interleaved step by step."""
+    found = entries(horizon)
+    env_of = {
+        e.name: gym.make("quad/Regulation-v0", start_box=0.0, preview=max(25, horizon), **SCENES[scene])
+        for e in found
+    }
+    policy_of = {e.name: e.make(env_of[e.name], horizon) for e in found}
+    times: dict[str, list[list[float]]] = {e.name: [] for e in found}
+    cost, fallbacks = dict.fromkeys(times, 0.0), dict.fromkeys(times, 0)
+    for repetition in range(repetitions + 1):  # the first compiles
+        flying = [e for e in found if not (e.slow and repetition > 1)]
+        seen = {e.name: env_of[e.name].reset(seed=0)[0] for e in flying}
+        state: dict[str, Any] = dict.fromkeys(seen)
+        for name in seen:
+            cost[name] = 0.0
+            times[name].append([])
+        start = np.ones(1, dtype=np.bool_)
+        for _ in range(env_of[found[0].name].unwrapped.task.episode_steps):
+            for name in seen:
+                begin = perf_counter()
+                action, state[name] = policy_of[name].predict(seen[name][None], state[name], start)
+                times[name][-1].append(perf_counter() - begin)
+                seen[name], _, _, _, info = env_of[name].step(action[0])
+                cost[name] += info["stage_cost"]
+            start = np.zeros(1, dtype=np.bool_)
+        for name in seen:
+            fallbacks[name] = int(getattr(state[name], "fallbacks", np.zeros((1, 5)))[0, 1:].sum())
+    return {
+        name: Result(*quantiles(list(np.min(rows[1:], axis=0))), cost[name], fallbacks[name])
+        for name, rows in times.items()
+    }
+
+
+def batch_rate(n: int = 256, steps: int = 40) -> dict[str, float]:
+    """Decisions per second of one batched `predict` over many vehicles, constraints active; N = 25."""
+    env = gym.make_vec(
+        "quad/Regulation-v0", num_envs=n, **{**SCENES["tight"], "start_box": 3.0, "start": (0.0,) * 3}
+    )
+    out = {}
+    for name in ("lmpc", "sdc-nmpc", "nmpc"):
+        policy = make_policy(name, env)
+        best = 0.0
+        for _ in range(3):
+            observations, _ = env.reset(seed=0)
+            state, start, seconds = None, np.ones(n, dtype=np.bool_), 0.0
+            for _ in range(steps):
+                begin = perf_counter()
+                actions, state = policy.predict(observations, state, start)
+                seconds += perf_counter() - begin
+                observations, *_ = env.step(actions)
+                start = np.zeros(n, dtype=np.bool_)
+            best = max(best, n * steps / seconds)
+        out[name] = best
+    return out
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.decide", description=__doc__.splitlines()[0])
+    parser.add_argument("--horizons", type=int, nargs="+", default=[5, 10, 15, 25, 35, 45])
+    parser.add_argument("--repetitions", type=int, default=5)
+    parser.add_argument("--quick", action="store_true", help="N = 25 only, two repetitions")
+    parser.add_argument("--json", action="store_true", help="machine-readable")
+    arguments = parser.parse_args()
+    horizons, repetitions = ([25], 2) if arguments.quick else (arguments.horizons, arguments.repetitions)
+    results: dict[str, dict[str, Any]] = {}
+    if not arguments.json:
+        print(machine())
+    for horizon in horizons:
+        for scene in SCENES:
+            found = fly_in_turns(scene, horizon, repetitions)
+            results[f"N = {horizon}, {scene}"] = {name: row._asdict() for name, row in found.items()}
+            if not arguments.json:
+                _print(f"N = {horizon}, {scene}", found)
+    rate = batch_rate()
+    if arguments.json:
+        json.dump({"machine": machine(), "results": results, "decisions/s": rate}, sys.stdout, indent=2)
+        print()
+        return
+    print("\none batched predict over 256 vehicles, N = 25, tight:")
+    for name, value in rate.items():
+        print(f"  {name}: {value:,.0f} decisions/s")
+
+
+def _print(title: str, found: dict[str, Result]) -> None:
+    base = found["sdc-nmpc"].p50
+    rows = [
+        [
+            name,
+            *(f"{value:.3f}" for value in row[:3]),
+            f"{row.p50 / base:.1f}",
+            f"{row.cost:.2f}",
+            str(row.fallbacks),
+        ]
+        for name, row in found.items()
+    ]
+    header = [title, "p50 ms", "p99 ms", "max ms", "p50 / sdc-nmpc", "cost", "fallbacks"]
+    print("\n" + format_table(header, rows), flush=True)
+
+
+if __name__ == "__main__":
+    main()

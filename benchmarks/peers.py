@@ -1,0 +1,149 @@
+"""Other people's solvers as policies on our observations, for comparison in one run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from controllers import dare, hover_pair
+from controllers.ocp import OcpQp, condense, first_move_bounds
+from controllers.solvers import Multipliers, Solution, Status
+from quad_envs.constraints import actions_from_forces
+from quad_envs.parameters import N_INPUT, N_STATE, Array
+from quad_envs.tasks import Task
+
+
+class DaqpSolver:
+    """DAQP, a dense active-set solver in C, on the condensed problem; box and rate rows only."""
+
+    def solve(self, qp: OcpQp) -> Solution:
+        """Condense and solve."""
+        import daqp
+
+        if len(qp.rows.stage):
+            raise ValueError("the DAQP comparison takes box and rate rows only")
+        H, g, S, f = condense(qp)
+        N, size = len(qp.c), len(g)
+        moves = np.eye(size) - np.eye(size, k=-N_INPUT)
+        low, high = np.tile(qp.lower, N), np.tile(qp.upper, N)
+        step_low, step_high = np.full(size, -qp.rate_step), np.full(size, qp.rate_step)
+        first_low, first_high = first_move_bounds(qp)
+        low[:N_INPUT], high[:N_INPUT] = (
+            np.maximum(low[:N_INPUT], first_low),
+            np.minimum(high[:N_INPUT], first_high),
+        )
+        step_low[:N_INPUT], step_high[:N_INPUT] = -1e30, 1e30
+        u, _, flag, info = daqp.solve(
+            H, g, moves, np.r_[high, step_high], np.r_[low, step_low], np.zeros(2 * size, np.int32)
+        )
+        x = np.einsum("ijk,k->ij", S, u) + f
+        status = Status.OPTIMAL if flag == 1 else Status.INFEASIBLE
+        empty = np.zeros(0)
+        multipliers = Multipliers(*(np.zeros((N, N_INPUT)) for _ in range(4)), empty, empty)
+        return Solution(status, u.reshape(N, N_INPUT), x, multipliers, int(info["iterations"]))
+
+
+class IpoptPolicy:
+    """Exact NMPC solved to convergence by CasADi and IPOPT: multiple shooting, warm started; box and rate limits.
+
+    The same prediction (one RK4 step per sample), cost (v_ref in the slot of V_B) and constraints as
+    `nmpc` with `velocity_error="body"` and `frame="hover"`.
+    """
+
+    def __init__(self, task: Task, horizon: int = 25) -> None:
+        self.task, self.horizon = task, horizon
+        self._solver, self._bounds = _build(task, horizon)
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[Any, Any]:
+        """One decision for one vehicle."""
+        N = self.horizon
+        view = self.task.layout.decode(observation[0])
+        x_0 = np.concatenate([np.zeros(3), view.V_B, view.Theta, view.Omega])
+        r = np.zeros((N + 1, N_STATE))
+        r[:, :6] = view.preview[: N + 1, :6]
+        r[:, 8] = np.arctan2(view.preview[: N + 1, 6], view.preview[: N + 1, 7])
+        if state is None or (episode_start is not None and np.any(episode_start)):
+            guess = np.concatenate([np.tile(x_0, N + 1), np.zeros(N_INPUT * N)])
+        else:
+            guess = state
+        last = view.last_command - self.task.hover_force
+        answer = self._solver(x0=guess, p=np.concatenate([x_0, last, r.ravel()]), **self._bounds)
+        z = np.array(answer["x"]).ravel()
+        X, U = z[: N_STATE * (N + 1)].reshape(N + 1, -1), z[N_STATE * (N + 1) :].reshape(N, -1)
+        action = actions_from_forces(
+            U[:1] + self.task.hover_force, self.task.hover_force, self.task.force_max
+        )
+        X, U = np.vstack([X[1:], X[-1:]]), np.vstack([U[1:], U[-1:]])
+        X[:, :3] -= X[0, :3]
+        return action, np.concatenate([X.ravel(), U.ravel()])
+
+
+def _build(task: Task, N: int) -> tuple[Any, dict[str, Array]]:
+    """The NLP once, with x_0, the last input and the references as parameters."""
+    import casadi as ca
+
+    step = _rk4(ca, task)
+    A, B = hover_pair(task.params, task.dt)
+    Q, R = task.weights.Q_matrix(), task.weights.R_matrix()
+    P = ca.DM(dare(A, B, Q, R))
+    X, U = ca.SX.sym("X", N_STATE, N + 1), ca.SX.sym("U", N_INPUT, N)
+    p = ca.SX.sym("p", N_STATE + N_INPUT + N_STATE * (N + 1))
+    r = ca.reshape(p[N_STATE + N_INPUT :], N_STATE, N + 1)
+    gaps, moves, cost, before = [X[:, 0] - p[:N_STATE]], [], 0, p[N_STATE : N_STATE + N_INPUT]
+    for i in range(N):
+        e = X[:, i] - r[:, i]
+        cost += ca.bilin(ca.DM(Q), e, e) + ca.bilin(ca.DM(R), U[:, i], U[:, i])
+        gaps.append(step(X[:, i], U[:, i] + task.hover_force) - X[:, i + 1])
+        moves.append(U[:, i] - before)
+        before = U[:, i]
+    e = X[:, N] - r[:, N]
+    cost += ca.bilin(P, e, e)
+    problem = {"x": ca.vertcat(ca.vec(X), ca.vec(U)), "p": p, "f": cost, "g": ca.vertcat(*gaps, *moves)}
+    options = {
+        "ipopt.print_level": 0,
+        "print_time": False,
+        "ipopt.warm_start_init_point": "yes",
+        "ipopt.sb": "yes",
+    }
+    free, change = np.full(N_STATE * (N + 1), np.inf), np.full(N_INPUT * N, task.limits.rate * task.dt)
+    still = np.zeros(N_STATE * (N + 1))
+    bounds = {
+        "lbx": np.r_[-free, np.full(N_INPUT * N, -task.hover_force)],
+        "ubx": np.r_[free, np.full(N_INPUT * N, task.force_max - task.hover_force)],
+        "lbg": np.r_[still, -change],
+        "ubg": np.r_[still, change],
+    }
+    return ca.nlpsol("solver", "ipopt", problem, options), bounds
+
+
+def _rk4(ca: Any, task: Task) -> Any:
+    """x_{k+1} = phi(x_k, F_k) in CasADi, written from Eq. (2.32) and not from our kernels."""
+    params = task.params
+    Jx, Jy, Jz = params.inertia
+    x, F = ca.SX.sym("x", N_STATE), ca.SX.sym("F", N_INPUT)
+    V, Omega = x[3:6], x[9:12]
+    sf, cf, st, ct, ss, cs = (g(x[6 + i]) for i in range(3) for g in (ca.sin, ca.cos))
+    R = ca.vertcat(
+        ca.horzcat(ct * cs, ct * ss, -st),
+        ca.horzcat(st * cs * sf - ss * cf, st * ss * sf + cs * cf, ct * sf),
+        ca.horzcat(st * cs * cf + ss * sf, st * ss * cf - cs * sf, ct * cf),
+    )
+    W = ca.vertcat(
+        ca.horzcat(1, sf * st / ct, cf * st / ct), ca.horzcat(0, cf, -sf), ca.horzcat(0, sf / ct, cf / ct)
+    )
+    gyro = ca.vertcat(
+        (Jy - Jz) / Jx * Omega[1] * Omega[2],
+        (Jz - Jx) / Jy * Omega[0] * Omega[2],
+        (Jx - Jy) / Jz * Omega[0] * Omega[1],
+    )
+    drift = ca.vertcat(R.T @ V, ca.cross(V, Omega) + R @ ca.DM([0, 0, params.gravity]), W @ Omega, gyro)
+    f = ca.Function("f", [x, F], [drift + ca.DM(params.input_matrix()) @ F])
+    h = task.dt
+    k1 = f(x, F)
+    k2 = f(x + h / 2 * k1, F)
+    k3 = f(x + h / 2 * k2, F)
+    k4 = f(x + h * k3, F)
+    return ca.Function("phi", [x, F], [x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])

@@ -1,0 +1,179 @@
+"""Environment speed: `python -m benchmarks.step [--seconds 1] [--json]`.
+
+Control steps, physics substeps and simulated seconds per second, for one environment through `gymnasium.make`
+with its default wrappers, for the bare compiled step, and for vector environments; l2f beside them in the
+same run when it is installed. Rewards, limits, observations with preview and autoreset are included
+everywhere but in "bare" and in l2f.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import importlib.util
+import json
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from .timing import machine, one_thread, rates
+
+one_thread()
+
+import gymnasium as gym  # noqa: E402
+import numpy as np  # noqa: E402
+
+import quad_envs  # noqa: E402, F401
+from baselines.table import format_table  # noqa: E402
+
+_ID = "quad/HelixTracking-v0"
+_STEPS = 1000  # control steps of a single environment in one call
+_DT = 0.05  # s
+
+
+def _single(substeps: int) -> Callable[[], object]:
+    env = gym.make(_ID, substeps=substeps)
+    env.reset(seed=0)
+    action = np.zeros(4, dtype=np.float32)
+
+    def call() -> None:
+        for _ in range(_STEPS):
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+
+    return call
+
+
+def _bare(substeps: int) -> Callable[[], object]:
+    """The compiled step of one environment, called from Python on arrays that are there already."""
+    env: Any = gym.make(
+        _ID, substeps=substeps, time_limit=1e6 * _DT, preview=25, reference="setpoint"
+    ).unwrapped
+    env.reset(seed=0)
+    batch = env._batch
+    action, out = np.zeros((1, 4), dtype=np.float32), np.empty((1, env.task.layout.size), dtype=np.float32)
+
+    def call() -> None:
+        for _ in range(_STEPS):
+            batch.step(action, out)
+        batch.rows[0, :12] = 0.0
+        batch.rows[0, 43] = 0.0
+
+    return call
+
+
+def _vector(n: int, substeps: int) -> tuple[Callable[[], object], int]:
+    env = gym.make_vec(_ID, num_envs=n, substeps=substeps)
+    env.reset(seed=0)
+    actions = np.zeros((n, 4), dtype=np.float32)
+    steps = max(1, 4096 // n)
+
+    def call() -> None:
+        for _ in range(steps):
+            env.step(actions)
+
+    return call, n * steps
+
+
+def _l2f_single() -> Callable[[], object]:
+    import l2f  # type: ignore[import-not-found]
+
+    device = l2f.Device()
+    rng, env = l2f.Rng(), l2f.Environment()
+    parameters, state, following = l2f.Parameters(), l2f.State(), l2f.State()
+    observation = l2f.Observation()
+    l2f.initialize_environment(device, env)
+    l2f.initialize_rng(device, rng, 0)
+    l2f.initial_parameters(device, env, parameters)
+    l2f.initial_state(device, env, parameters, state)
+    action = [0.0] * 4
+
+    def call() -> None:
+        for _ in range(_STEPS):
+            l2f.step(device, env, parameters, state, action, following, rng)
+            l2f.observe(device, env, parameters, following, observation, rng)
+
+    return call
+
+
+def _l2f_vector(n: int) -> tuple[Callable[[], object], int]:
+    device = importlib.import_module("l2f").Device()
+    vector = getattr(importlib.import_module("l2f"), f"vector{n}")
+    rng, env = vector.VectorRng(), vector.VectorEnvironment()
+    parameters, state, following = vector.VectorParameters(), vector.VectorState(), vector.VectorState()
+    vector.initialize_rng(device, rng, 0)
+    vector.initialize_environment(device, env)
+    vector.sample_initial_parameters(device, env, parameters, rng)
+    vector.sample_initial_state(device, env, parameters, state, rng)
+    actions = np.zeros((n, 4), dtype=np.float32)
+    observations = np.zeros((n, env.OBSERVATION_DIM), dtype=np.float32)
+    steps = max(1, 4096 // n)
+
+    def call() -> None:
+        for _ in range(steps):
+            vector.step(device, env, parameters, state, actions, following, rng)
+            vector.observe(device, env, parameters, following, observations, rng)
+
+    return call, n * steps
+
+
+def measure(seconds: float) -> dict[str, dict[str, float]]:
+    """Name -> control steps, substeps and simulated seconds per second."""
+    candidates: dict[str, tuple[Callable[[], object], int]] = {}
+    physics: dict[str, tuple[int, float]] = {}
+    for substeps in (1, 2, 5, 10):
+        candidates[f"one env, {substeps} substeps"] = _single(substeps), _STEPS
+        physics[f"one env, {substeps} substeps"] = substeps, _DT
+    candidates["bare step, 5 substeps"] = _bare(5), _STEPS
+    physics["bare step, 5 substeps"] = 5, _DT
+    for n in (8, 64, 1024, 4096):
+        candidates[f"vector of {n}, 5 substeps"] = _vector(n, 5)
+        physics[f"vector of {n}, 5 substeps"] = 5, _DT
+    if importlib.util.find_spec("l2f"):
+        candidates["l2f: one, step + observe"] = _l2f_single(), _STEPS
+        candidates["l2f: vector of 1024"] = _l2f_vector(1024)
+        physics["l2f: one, step + observe"] = physics["l2f: vector of 1024"] = 1, 0.01
+    found = rates(candidates, seconds)
+    return {
+        name: {
+            "control steps/s": rate,
+            "substeps/s": rate * physics[name][0],
+            "simulated s/s": rate * physics[name][1],
+        }
+        for name, rate in found.items()
+    }
+
+
+def ratios(found: dict[str, dict[str, float]]) -> dict[str, float]:
+    """The comparisons that the README quotes."""
+    rate = {name: row["control steps/s"] for name, row in found.items()}
+    out = {"bare step / one env": rate["bare step, 5 substeps"] / rate["one env, 5 substeps"]}
+    for name in ("l2f: one, step + observe", "l2f: vector of 1024"):
+        if name in rate:
+            ours = "one env, 5 substeps" if "one" in name else "vector of 1024, 5 substeps"
+            out[f"{ours} / {name}"] = rate[ours] / rate[name]
+    return out
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.step", description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=1.0, help="time for each measurement (default 1)")
+    parser.add_argument("--json", action="store_true", help="machine-readable")
+    arguments = parser.parse_args()
+    found = measure(arguments.seconds)
+    if arguments.json:
+        json.dump({"machine": machine(), "rates": found, "ratios": ratios(found)}, sys.stdout, indent=2)
+        print()
+        return
+    columns = ["control steps/s", "substeps/s", "simulated s/s"]
+    rows = [[name, *(f"{row[column]:,.0f}" for column in columns)] for name, row in found.items()]
+    print(machine(), end="\n\n")
+    print(format_table(["", *columns], rows), end="\n\n")
+    for name, ratio in ratios(found).items():
+        print(f"{name}: {ratio:.2f}")
+
+
+if __name__ == "__main__":
+    main()
