@@ -9,7 +9,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 .PHONY: demo test slow clean
 
 demo: $(VENV)/installed
-	$(BIN)/quad-envs benchmark quick --out runs/demo
+	$(BIN)/quad-envs benchmark quick --fresh --out runs/demo
 
 test: $(VENV)/installed-dev
 	$(BIN)/ruff check .

@@ -42,12 +42,12 @@ class _InnerLowering(NativeLowering):  # type: ignore[misc]
         # Numba wants a callable of its own to register the kernel under. This one is never called.
         context.get_executable = lambda library, descriptor, env: {}.popitem
         try:
-            return bool(super().run_pass(state))
+            return bool(super().run_pass(state))  # type: ignore[no-untyped-call]
         finally:
             del context.get_executable
 
 
-class _InnerCompiler(CompilerBase):  # type: ignore[misc]
+class _InnerCompiler(CompilerBase):
     """Numba's pipeline with `_InnerLowering` in place of native lowering."""
 
     def define_pipelines(self) -> list[Any]:
@@ -61,14 +61,14 @@ class _InnerCompiler(CompilerBase):  # type: ignore[misc]
         return [manager]
 
 
-class _Kernel(CPUDispatcher):  # type: ignore[misc]
+class _Kernel(CPUDispatcher):
     """A function compiled into the kernels that call it, and on its own when Python calls it."""
 
     def __init__(self, function: Callable[..., Any], inline: bool) -> None:
         options = {"nopython": True, "boundscheck": None, "error_model": "numpy", "forceinline": inline}
         inner = {**options, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
         super().__init__(py_func=function, targetoptions=inner, pipeline_class=_InnerCompiler)
-        self._outer = numba.njit(cache=True, error_model="numpy")(function)
+        self._outer: Any = numba.njit(cache=True, error_model="numpy")(function)
         file = getattr(self._outer._cache, "_cache_file", None)
         if file is not None and function.__module__.split(".")[0] in _PACKAGES:
             file._source_stamp = _source_stamp()

@@ -16,6 +16,11 @@ from ..parameters import N_STATE, Array, Limits, QuadrotorParams, Weights
 from ..references import Reference, make_reference
 from ..tasks import Task
 
+# Arguments that are one number; what it may be is checked where it is used.
+_NUMBERS = (
+    *("mass", "gravity", "arm", "yaw_moment", "rotor_rate", "drag", "kappa", "rate_limit", "tilt_limit"),
+    *("velocity_limit", "dt", "time_limit", "lost_distance"),
+)
 RANDOMIZABLE = ("mass", "inertia", "arm", "kappa", "rotor_rate", "drag")
 _Triple = tuple[float, float, float]
 
@@ -87,6 +92,9 @@ class TrackingOptions:
     reward: str = "bounded"
 
     def __post_init__(self) -> None:
+        for name in _NUMBERS:
+            if not isinstance(getattr(self, name), int | float | np.integer | np.floating):
+                raise ValueError(f"{name} must be a number, got {getattr(self, name)!r}")
         for name in ("dt", "time_limit", "lost_distance"):
             value = getattr(self, name)
             if not (_is_number(value) and value > 0.0):
