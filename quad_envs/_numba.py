@@ -30,7 +30,7 @@ _PACKAGES = ("quad_envs", "controllers", "baselines")
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
-class _InnerLowering(NativeLowering):  # type: ignore[misc]
+class _InnerLowering(NativeLowering):
     """Lower to LLVM code and stop there: it becomes machine code as a part of its caller."""
 
     _name = "inner_lowering"
@@ -68,8 +68,9 @@ class _Kernel(CPUDispatcher):
         options = {"nopython": True, "boundscheck": None, "error_model": "numpy", "forceinline": inline}
         inner = {**options, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
         super().__init__(py_func=function, targetoptions=inner, pipeline_class=_InnerCompiler)
-        self._outer: Any = numba.njit(cache=True, error_model="numpy")(function)
-        file = getattr(self._outer._cache, "_cache_file", None)
+        outer: Any = numba.njit(cache=True, error_model="numpy")(function)
+        self._outer = outer
+        file = getattr(outer._cache, "_cache_file", None)
         if file is not None and function.__module__.split(".")[0] in _PACKAGES:
             file._source_stamp = _source_stamp()
 
