@@ -20,13 +20,6 @@ from .solvers.structured import ITERATION_LIMIT, Workspace
 
 
 @kernel
-def _hold_trim_everywhere(A: Array, s: Scratch) -> None:
-    """The affine terms of all stages."""
-    for i in range(s.c.shape[0]):
-        hold_trim(A[0], s.trim, s.c[i])
-
-
-@kernel
 def _decide_rows(
     plants: Array,
     windows: Array,
@@ -51,7 +44,7 @@ def _decide_rows(
     s = carve(buffer, N, 1, data.normals.shape[0], data.normal.shape[0], 0)
     for j in range(plants.shape[0]):
         begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
-        _hold_trim_everywhere(A, s)
+        hold_trim(A, s.trim, s.c)
         has_plan = memories[j, 0] > 0.0
         level, iterations = solve_row(A, B, data.Q, data.P, True, s.r, has_plan, data, s, ws)
         end_row(level, plants[j], lasts[j], disturbances[j], memories[j], data, s, ws.u, commands[j], kept[j])
@@ -75,6 +68,7 @@ class LinearMPC(Mpc):
         velocity_reference: How v_ref is turned before it is compared with V_B, in frame "heading": by the
             present "heading", or by the whole present "attitude", which costs up to 3 times less here.
         soft_weight: Exact penalty per unit of a state row; inf makes the rows hard.
+        margin: What the plan keeps from each state limit, in its SI unit: cover for the unmodelled rotor lag.
         reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
         estimator_gain: Share of each new residual in the estimate, in (0, 1].
         iteration_limit: Largest number of active-set steps of a solve.
@@ -92,6 +86,7 @@ class LinearMPC(Mpc):
         frame: Frame = "heading",
         velocity_reference: VelocityReference = "attitude",
         soft_weight: float = 1e3,
+        margin: float = 0.02,
         reject_disturbance: bool = False,
         estimator_gain: float = ESTIMATOR_GAIN,
         iteration_limit: int = ITERATION_LIMIT,
@@ -101,6 +96,7 @@ class LinearMPC(Mpc):
             frame,
             velocity_reference,
             soft_weight,
+            margin,
             reject_disturbance,
             estimator_gain,
             iteration_limit,
@@ -115,5 +111,5 @@ class LinearMPC(Mpc):
         return _decide_rows(*arguments)
 
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
-        _hold_trim_everywhere(self._A, s)
+        hold_trim(self._A, s.trim, s.c)
         return Problem(self._A, self._B, self._data.Q, self._data.P, True, s.r)

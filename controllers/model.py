@@ -25,7 +25,7 @@ from quad_envs.parameters import (
 )
 from quad_envs.rotations import sincos
 
-from .linalg import matmul
+from .linalg import fill, matmul
 
 ZOH_SCRATCH = 3  # (12, 12) matrices that `zero_order_hold` needs
 RK4_SCRATCH = 52  # rows of 16 that `rk4_sensitivities` needs
@@ -90,7 +90,7 @@ def sdc_matrix(x: Array, alpha: float, c: Array, out: Array) -> None:
     sf, cf = sincos(phi)
     st, ct = sincos(theta)
     ss, cs = sincos(x[8])
-    out[:, :] = 0.0
+    fill(out, 0.0)
     _set_rotation(sf, cf, st, ct, ss, cs, out)
     _set_euler_rates(sf, cf, st, ct, out)
     out[3, 3], out[3, 4], out[3, 5] = -c[DRAG_RATE], beta * r, -beta * q
@@ -146,7 +146,7 @@ def jacobian(x: Array, d: Array, c: Array, out: Array) -> None:
     sf, cf = sincos(x[6])
     st, ct = sincos(x[7])
     ss, cs = sincos(x[8])
-    out[:, :] = 0.0
+    fill(out, 0.0)
     _set_rotation(sf, cf, st, ct, ss, cs, out)
     side = cf * v - sf * w  # V_B turned back through phi, then through theta
     under = sf * v + cf * w

@@ -50,6 +50,7 @@ class MpcOptions:
     frame: Frame
     velocity_reference: VelocityReference
     soft_weight: float
+    margin: float
     reject_disturbance: bool
     estimator_gain: float
     iteration_limit: int
@@ -60,6 +61,10 @@ class MpcOptions:
         require_choice("velocity_reference", self.velocity_reference, VelocityReference)
         if not self.soft_weight >= 0.0:
             raise ValueError(f"soft_weight must be >= 0 (math.inf for hard rows), got {self.soft_weight!r}")
+        if not 0.0 <= self.margin < math.inf:
+            raise ValueError(
+                f"margin must be a finite number >= 0, in SI units of each limit, got {self.margin!r}"
+            )
         if not 0.0 < self.estimator_gain <= 1.0:
             raise ValueError(f"estimator_gain must lie in (0, 1], got {self.estimator_gain!r}")
         if self.iteration_limit < 1:
@@ -77,8 +82,8 @@ class Problem(NamedTuple):
     r: Array  # (N+1, 12)
 
 
-def limit_rows(limits: Limits, weight: float, horizon: int) -> tuple[StateRows, IntArray]:
-    """State rows of the finite limits at stages 1..N, and the position axis of each output (-1: none).
+def limit_rows(limits: Limits, margin: float, weight: float, horizon: int) -> tuple[StateRows, IntArray]:
+    """State rows of the finite limits, less a margin, at stages 1..N, and the position axis of each output (-1: none).
 
     Outputs: body velocity components, roll and pitch, coordinates of the position, in this order.
     """
@@ -88,6 +93,11 @@ def limit_rows(limits: Limits, weight: float, horizon: int) -> tuple[StateRows, 
     lower[POSITION], upper[POSITION] = limits.position_lower, limits.position_upper
     order = np.r_[VELOCITY, ATTITUDE, POSITION]
     outputs = order[np.isfinite(lower[order]) | np.isfinite(upper[order])]
+    lower, upper = lower + margin, upper - margin
+    if (lower > upper).any():
+        raise ValueError(
+            f"margin {margin!r} leaves nothing between the limits of the task; choose a smaller one"
+        )
     rows = output_rows(np.eye(N_STATE)[outputs], lower[outputs], upper[outputs], weight, horizon)
     return rows, np.where(outputs < POSITION.stop, outputs, -1).astype(np.int64)
 
@@ -100,7 +110,7 @@ def _mpc_data(task: Task, horizon: int, options: MpcOptions) -> MpcData:
             f"frame 'heading' needs equal weights on x and y, got {Q[0, 0]} and {Q[1, 1]}; use frame='hover'"
         )
     A, B = hover_pair(params, task.dt)
-    rows, axis = limit_rows(task.limits, options.soft_weight, horizon)
+    rows, axis = limit_rows(task.limits, options.margin, options.soft_weight, horizon)
     return MpcData(
         coefficients=params.coefficients(),
         B_c=params.input_matrix(),

@@ -17,6 +17,7 @@ from quad_envs.rotations import sincos, wrap_angle_scalar
 
 from .disturbance import ESTIMATOR_SCRATCH, N_DISTURBANCE, feed_forward, remember, update_estimate
 from .fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXED_WEIGHT, limit_command
+from .linalg import copy
 from .ocp import IntArray
 from .riccati import DARE_SCRATCH
 from .solvers.active_set import INFEASIBLE, OPTIMAL
@@ -82,6 +83,13 @@ def buffer_size(N: int, pairs: int, H: int, K: int, M: int) -> int:
     vectors = 2 * n + 4 * m + 2 * N_DISTURBANCE + ESTIMATOR_SCRATCH
     stages = n * (2 * N + 1) + pairs * n * (n + m) + n * H + 3 * K
     return vectors + stages + (2 + DARE_SCRATCH) * n * n + M * n * n + 2 * n * (M + 1) + m * M
+
+
+@kernel
+def copy_vector(x: Array, out: Array) -> None:
+    """As `linalg.copy`, for vectors."""
+    for i in range(out.shape[0]):
+        out[i] = x[i]
 
 
 @kernel
@@ -186,26 +194,29 @@ def set_references(plant: Array, window: Array, trim: Array, heading: bool, atti
 
 
 @kernel
-def set_rows(plant: Array, data: MpcData, s: Scratch) -> None:
-    """Limits on outputs; those on the position are turned and shifted with the frame."""
-    for h in range(data.normals.shape[0]):
-        for a in range(N_STATE):
-            s.normals[h, a] = data.normals[h, a]
-    for k in range(data.normal.shape[0]):
-        s.row_lower[k], s.row_upper[k], s.weight[k] = data.lower[k], data.upper[k], data.weight[k]
-    if not data.heading:
-        return
+def turn_rows(
+    plant: Array, axis: IntArray, normal: IntArray, normals: Array, lower: Array, upper: Array
+) -> None:
+    """Turn and shift the limits on the position with the frame, in place.
+
+    Args:
+        plant: Measured, (16,).
+        axis: Coordinate of the position that each output is, or -1, (H,).
+        normal: Output of each row, (K,).
+        normals: Outputs, (H, 12).
+        lower: Bounds, (K,).
+        upper: Bounds, (K,).
+    """
     sine, cosine = sincos(plant[8])
-    for h in range(data.normals.shape[0]):
-        if data.axis[h] == 0:
-            s.normals[h, 0], s.normals[h, 1] = cosine, -sine
-        elif data.axis[h] == 1:
-            s.normals[h, 0], s.normals[h, 1] = sine, cosine
-    for k in range(data.normal.shape[0]):
-        axis = data.axis[data.normal[k]]
-        if axis >= 0:
-            s.row_lower[k] -= plant[axis]
-            s.row_upper[k] -= plant[axis]
+    for h in range(axis.shape[0]):
+        if axis[h] == 0:
+            normals[h, 0], normals[h, 1] = cosine, -sine
+        elif axis[h] == 1:
+            normals[h, 0], normals[h, 1] = sine, cosine
+    for k in range(normal.shape[0]):
+        if axis[normal[k]] >= 0:
+            lower[k] -= plant[axis[normal[k]]]
+            upper[k] -= plant[axis[normal[k]]]
 
 
 @kernel
@@ -220,7 +231,8 @@ def begin_row(
     s: Scratch,
 ) -> None:
     """One sample's problem but for the model: disturbance, equilibrium, state, reference, bounds, rows."""
-    s.estimate[:] = 0.0
+    for i in range(N_DISTURBANCE):
+        s.estimate[i] = 0.0
     if data.gain > 0.0:
         kept = memory[1 + N_INPUT * s.c.shape[0] :]
         update_estimate(
@@ -238,22 +250,35 @@ def begin_row(
         s.lower[a] = -s.offset[a]
         s.upper[a] = data.force_max - s.offset[a]
         s.u_last[a] = last[a] - s.offset[a]
-    set_rows(plant, data, s)
+    copy(data.normals, s.normals)
+    copy_vector(data.lower, s.row_lower)
+    copy_vector(data.upper, s.row_upper)
+    copy_vector(data.weight, s.weight)
+    if data.heading:
+        turn_rows(plant, data.axis, data.normal, s.normals, s.row_lower, s.row_upper)
 
 
 @kernel
 def hold_trim(A: Array, trim: Array, c: Array) -> None:
-    """C = trim - A trim: the equilibrium stays one in the model; zero without a lateral force."""
-    for i in range(N_STATE):
-        c[i] = trim[i] - A[i, 6] * trim[6] - A[i, 7] * trim[7]
+    """c_i = trim - A_i trim, so that the equilibrium stays one in the model; zero without a lateral force.
+
+    Args:
+        A: (1 or N, 12, 12).
+        trim: (12,), of which only roll and pitch are not zero.
+        c: Result, (N, 12).
+    """
+    for i in range(c.shape[0]):
+        j = i if A.shape[0] > 1 else 0
+        for a in range(N_STATE):
+            c[i, a] = trim[a] - A[j, a, 6] * trim[6] - A[j, a, 7] * trim[7]
 
 
 @kernel
-def _widen(s: Scratch) -> None:
-    """No bounds on the inputs."""
-    for a in range(N_INPUT):
-        s.lower[a] = -math.inf
-        s.upper[a] = math.inf
+def _widen(lower: Array, upper: Array) -> None:
+    """No bounds."""
+    for k in range(lower.shape[0]):
+        lower[k] = -math.inf
+        upper[k] = math.inf
 
 
 @kernel
@@ -277,11 +302,10 @@ def solve_row(
     level = NONE
     iterations = 0
     rate_step = data.rate_step
-    K = data.normal.shape[0]
     while True:
         status, count = solve_structured(
             A, B, s.c, Q, data.R, Q_f, stationary, s.x_0, r, s.lower, s.upper, rate_step, s.u_last,
-            s.normals, data.normal[:K], data.stage[:K], s.row_lower[:K], s.row_upper[:K], s.weight[:K],
+            s.normals, data.normal, data.stage, s.row_lower, s.row_upper, s.weight,
             data.iteration_limit, ws,
         )  # fmt: skip
         iterations += count
@@ -291,15 +315,15 @@ def solve_row(
             return HOVER, iterations
         if level == NONE and status == INFEASIBLE:
             level = RELAXED
-            for k in range(K):
+            for k in range(s.weight.shape[0]):
                 s.weight[k] = min(s.weight[k], RELAXED_WEIGHT)
         elif has_plan:
             return PREVIOUS_PLAN, iterations
         else:
             level = CLIPPED_SDRE
             rate_step = math.inf
-            K = 0
-            _widen(s)
+            _widen(s.lower, s.upper)
+            _widen(s.row_lower, s.row_upper)
 
 
 @kernel

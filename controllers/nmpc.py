@@ -17,9 +17,10 @@ from quad_envs.tasks import Task
 from .controller import first_non_finite
 from .disturbance import ESTIMATOR_GAIN
 from .fallback import RELAXED
+from .linalg import copy, fill
 from .model import RK4_SCRATCH, rk4_sensitivities, rotated_derivatives
 from .mpc import Frame, Mpc, MpcOptions, Problem, SolverName, require_choice
-from .mpc_kernels import MpcData, Scratch, begin_row, carve, end_row, solve_row
+from .mpc_kernels import MpcData, Scratch, begin_row, carve, copy_vector, end_row, solve_row
 from .ocp import IntArray
 from .solvers.structured import ITERATION_LIMIT, Workspace
 
@@ -53,19 +54,18 @@ def load_guess(plan: Array, kept: Array, heading: bool, s: Scratch) -> None:
     for i in range(N + 1):
         if held:
             X = old[min(i + 1, N)]
-            for a in range(N_STATE):
-                s.X[i, a] = X[a]
+            copy_vector(X, s.X[i])
             x, y = X[0] - first[0], X[1] - first[1]
             s.X[i, 0] = s.x_0[0] + cosine * x + sine * y
             s.X[i, 1] = s.x_0[1] + cosine * y - sine * x
             s.X[i, 2] = s.x_0[2] + X[2] - first[2]
             s.X[i, 8] = X[8] + yaw
         else:
-            s.X[i, :] = s.x_0
+            copy_vector(s.x_0, s.X[i])
     for i in range(N):
         for a in range(N_INPUT):
             s.F[i, a] = plan[1 + N_INPUT * min(i + 1, N - 1) + a] if held else s.offset[a]
-    s.X[0, :] = s.x_0
+    copy_vector(s.x_0, s.X[0])
 
 
 @kernel
@@ -74,7 +74,7 @@ def linearise_model(data: MpcData, s: Scratch) -> None:
     point, x_next = s.square[9, 0], s.square[9, 1]
     scratch = s.square.reshape(-1)[:_RK4].reshape(RK4_SCRATCH, N_STATE + N_INPUT)
     for i in range(s.F.shape[0]):
-        point[:] = s.X[i]
+        copy_vector(s.X[i], point)
         point[7] = min(max(point[7], -_PITCH_LIMIT), _PITCH_LIMIT)
         rk4_sensitivities(
             point, s.F[i], s.d, data.coefficients, data.B_c, data.dt, x_next, s.A[i], s.B[i], scratch
@@ -119,9 +119,7 @@ def gauss_newton_weight(Q: Array, D: Array, out: Array) -> None:
         out: Result, (12, 12).
     """
     n = N_STATE
-    for i in range(n):
-        for j in range(n):
-            out[i, j] = Q[i, j]
+    copy(Q, out)
     for i in range(n):
         for a in range(3):
             for k in range(3):
@@ -143,11 +141,10 @@ def linearise_cost(inertial: bool, data: MpcData, s: Scratch) -> None:
     """
     N = s.F.shape[0]
     D = s.square[9, 2:5, :3]
-    D[:, :] = 0.0
+    fill(D, 0.0)
     for i in range(N + 1):
         r, X = s.target[i], s.X[i]
-        for a in range(N_STATE):
-            r[a] = s.r[i, a]
+        copy_vector(s.r[i], r)
         if data.heading:
             r[8] = X[8] - wrap_angle_scalar(X[8] - r[8])
         if inertial:
@@ -171,17 +168,18 @@ def take_step(u: Array, x: Array, s: Scratch) -> float:
             F = s.offset[a] + u[i, a]
             change = max(change, abs(F - s.F[i, a]))
             s.F[i, a] = F
-    s.X[:, :] = x
+    copy(x, s.X)
     return change
 
 
 @kernel
 def keep_guess(valid: bool, X: Array, kept: Array) -> None:
     """Write the guess to memory; after a failure the next sample starts afresh."""
-    kept[:] = 0.0
+    for k in range(kept.shape[0]):
+        kept[k] = 0.0
     if valid:
         kept[0] = 1.0
-        kept[1:].reshape(X.shape)[:, :] = X
+        copy(X, kept[1:].reshape(X.shape))
 
 
 @kernel
@@ -238,6 +236,7 @@ class ExactNmpc(Mpc):
         solver: See `LinearMPC`, as the options that follow.
         frame: "heading" or "hover".
         soft_weight: Exact penalty per unit of a state row; inf makes the rows hard.
+        margin: What the plan keeps from each state limit, in its SI unit: cover for the unmodelled rotor lag.
         reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
         estimator_gain: Share of each new residual in the estimate, in (0, 1].
         iteration_limit: Largest number of active-set steps of a solve.
@@ -256,6 +255,7 @@ class ExactNmpc(Mpc):
         solver: SolverName = "structured",
         frame: Frame = "heading",
         soft_weight: float = 1e3,
+        margin: float = 0.02,
         reject_disturbance: bool = False,
         estimator_gain: float = ESTIMATOR_GAIN,
         iteration_limit: int = ITERATION_LIMIT,
@@ -264,7 +264,7 @@ class ExactNmpc(Mpc):
             raise ValueError(f"passes must be a whole number >= 1, got {passes!r}")
         require_choice("velocity_error", velocity_error, VelocityError)
         options = MpcOptions(
-            solver, frame, "heading", soft_weight, reject_disturbance, estimator_gain, iteration_limit
+            solver, frame, "heading", soft_weight, margin, reject_disturbance, estimator_gain, iteration_limit
         )
         super().__init__(task, horizon, options, pairs=horizon, guess=True)
         self.passes = int(passes)

@@ -11,9 +11,10 @@ from quad_envs.tasks import Task
 from .controller import first_non_finite
 from .disturbance import ESTIMATOR_GAIN
 from .fallback import RELAXED
+from .linalg import copy
 from .model import sdc_matrix, zero_order_hold
 from .mpc import Frame, Mpc, MpcOptions, Problem, SolverName, VelocityReference, require_choice
-from .mpc_kernels import MpcData, Scratch, begin_row, carve, end_row, hold_trim, solve_row
+from .mpc_kernels import MpcData, Scratch, begin_row, carve, copy_vector, end_row, hold_trim, solve_row
 from .ocp import IntArray
 from .riccati import solve_dare
 from .solvers.structured import ITERATION_LIMIT, Workspace
@@ -31,11 +32,10 @@ def freeze_model(alpha: float, sdre_weight: bool, data: MpcData, s: Scratch) -> 
     """
     sdc_matrix(s.x_0, alpha, data.coefficients, s.A_c)
     zero_order_hold(s.A_c, data.B_c, data.dt, s.A[0], s.B[0], s.square)
-    for i in range(s.c.shape[0]):
-        hold_trim(s.A[0], s.trim, s.c[i])
+    hold_trim(s.A[:1], s.trim, s.c)
     if sdre_weight and solve_dare(s.A[0], s.B[0], data.Q[0], data.R, s.P, s.square) > 0:
         return True
-    s.P[:, :] = data.P
+    copy(data.P, s.P)
     return False
 
 
@@ -43,11 +43,11 @@ def freeze_model(alpha: float, sdre_weight: bool, data: MpcData, s: Scratch) -> 
 def relinearise(u: Array, alpha: float, data: MpcData, s: Scratch) -> None:
     """The N pairs met along x_{i+1} = A(x_i) x_i + B(x_i) u_i + c_i under the plan u; memoryless."""
     x, x_next = s.square[3, 0], s.square[3, 1]
-    x[:] = s.x_0
+    copy_vector(s.x_0, x)
     for i in range(u.shape[0]):
         sdc_matrix(x, alpha, data.coefficients, s.A_c)
         zero_order_hold(s.A_c, data.B_c, data.dt, s.A[i], s.B[i], s.square)
-        hold_trim(s.A[i], s.trim, s.c[i])
+        hold_trim(s.A[i : i + 1], s.trim, s.c[i : i + 1])
         for a in range(N_STATE):
             total = s.c[i, a]
             for b in range(N_STATE):
@@ -55,7 +55,7 @@ def relinearise(u: Array, alpha: float, data: MpcData, s: Scratch) -> None:
             for b in range(u.shape[1]):
                 total += s.B[i, a, b] * u[i, b]
             x_next[a] = total
-        x[:] = x_next
+        copy_vector(x_next, x)
         x[6] = min(max(x[6], -_TILT_LIMIT), _TILT_LIMIT)
         x[7] = min(max(x[7], -_TILT_LIMIT), _TILT_LIMIT)
 
@@ -124,6 +124,7 @@ class SdcNmpc(Mpc):
         frame: "heading" or "hover".
         velocity_reference: "heading" or "attitude".
         soft_weight: Exact penalty per unit of a state row; inf makes the rows hard.
+        margin: What the plan keeps from each state limit, in its SI unit: cover for the unmodelled rotor lag.
         reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
         estimator_gain: Share of each new residual in the estimate, in (0, 1].
         iteration_limit: Largest number of active-set steps of a solve.
@@ -144,6 +145,7 @@ class SdcNmpc(Mpc):
         frame: Frame = "heading",
         velocity_reference: VelocityReference = "heading",
         soft_weight: float = 1e3,
+        margin: float = 0.02,
         reject_disturbance: bool = False,
         estimator_gain: float = ESTIMATOR_GAIN,
         iteration_limit: int = ITERATION_LIMIT,
@@ -160,6 +162,7 @@ class SdcNmpc(Mpc):
             frame,
             velocity_reference,
             soft_weight,
+            margin,
             reject_disturbance,
             estimator_gain,
             iteration_limit,

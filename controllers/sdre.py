@@ -15,9 +15,10 @@ from quad_envs.tasks import Task
 from .controller import Decision, as_rows, first_non_finite, raise_non_finite
 from .disturbance import feed_forward
 from .fallback import CLIPPED_SDRE, HOVER, NONE, limit_command
+from .linalg import copy
 from .model import hover_pair, sdc_matrix, zero_order_hold
 from .mpc import Frame, VelocityReference, require_choice
-from .mpc_kernels import set_references, set_state
+from .mpc_kernels import copy_vector, set_references, set_state
 from .ocp import IntArray
 from .riccati import DARE_SCRATCH, lqr_gain, solve_dare, stage_gains
 
@@ -89,14 +90,14 @@ def _decide_rows(
         level = NONE
         if alpha < 0.0 or not sdre_gain(x, alpha, c, B_c, Q, R, dt, K, scratch):
             level = NONE if alpha < 0.0 else CLIPPED_SDRE
-            K[:, :] = K_0
+            copy(K_0, K)
         for a in range(N_INPUT):
             F[a] = offset[a]
             for b in range(N_STATE):
                 F[a] -= K[a, b] * (x[b] - r[0, b])
         if not math.isfinite(F[0] + F[1] + F[2] + F[3]):
             level = HOVER
-            F[:] = offset
+            copy_vector(offset, F)
         limit_command(F, lasts[j], rate_step, force_max, commands[j])
         report[0, j], report[1, j] = level, 0
     return bad
