@@ -83,7 +83,7 @@ class Problem(NamedTuple):
 
 
 def limit_rows(limits: Limits, margin: float, weight: float, horizon: int) -> tuple[StateRows, IntArray]:
-    """State rows of the finite limits, less a margin, at stages 1..N, and the position axis of each output (-1: none).
+    """State rows of the limits, less a margin, at stages 1..N; the position axis of each output (-1: none).
 
     Outputs: body velocity components, roll and pitch, coordinates of the position, in this order.
     """
