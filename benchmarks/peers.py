@@ -45,7 +45,7 @@ class DaqpSolver:
 
 
 class IpoptPolicy:
-    """Exact NMPC solved to convergence by CasADi and IPOPT: multiple shooting, warm start, box and rate limits.
+    """Exact NMPC to convergence by CasADi and IPOPT: multiple shooting, warm start, box and rate limits.
 
     The same prediction (one RK4 step per sample), cost (v_ref in the slot of V_B) and constraints as
     `nmpc` with `velocity_error="body"` and `frame="hover"`.
