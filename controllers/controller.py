@@ -61,6 +61,12 @@ class Controller(Protocol):
         ...
 
 
+def _as_array(value: ArrayLike) -> Array:
+    """Contiguous, float64 and writeable: of any other kind numba would compile the kernels anew."""
+    array = np.ascontiguousarray(value, dtype=np.float64)
+    return array if array.flags.writeable else array.copy()
+
+
 def as_rows(
     plant: ArrayLike,
     window: ArrayLike,
@@ -75,11 +81,11 @@ def as_rows(
     Raises:
         ValueError: If a shape is wrong; it says which and what is expected.
     """
-    plants = np.ascontiguousarray(plant, dtype=np.float64)
-    windows = np.ascontiguousarray(window, dtype=np.float64)
-    lasts = np.ascontiguousarray(last_command, dtype=np.float64)
-    disturbances = np.ascontiguousarray(disturbance, dtype=np.float64)
-    memories = np.ascontiguousarray(memory, dtype=np.float64)
+    plants = _as_array(plant)
+    windows = _as_array(window)
+    lasts = _as_array(last_command)
+    disturbances = _as_array(disturbance)
+    memories = _as_array(memory)
     n = len(plants)
     shape = windows.shape
     if (

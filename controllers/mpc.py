@@ -121,9 +121,9 @@ def _mpc_data(task: Task, horizon: int, options: MpcOptions) -> MpcData:
         axis=axis,
         normal=rows.normal,
         stage=rows.stage,
-        lower=rows.lower,
-        upper=rows.upper,
-        weight=rows.weight,
+        lower=rows.lower.copy(),  # without rows these are read-only views, another type to numba
+        upper=rows.upper.copy(),
+        weight=rows.weight.copy(),
         dt=float(task.dt),
         force_max=float(task.force_max),
         rate_step=float(task.limits.rate * task.dt),

@@ -189,7 +189,7 @@ def test_position_box_is_kept_at_any_heading(flavour):
         last, memory = decision.command[0], decision.memory[0]
         plant = held_under(plant, last, controller.task, calm, k)
         lowest = min(lowest, plant[0])
-    assert -0.51 < lowest < -0.42  # it comes close and no further
+    assert -0.5 < lowest < -0.38  # it comes close and no further
 
 
 @pytest.mark.parametrize(
@@ -233,6 +233,21 @@ def test_bad_arguments_are_named(argument):
     bad = [*good[:argument], good[argument][:, :-1], *good[argument + 1 :]]
     with pytest.raises(ValueError, match=names[argument]):
         controller.decide(*bad)
+
+
+def test_arrays_of_any_kind_are_taken():
+    controller, rows = LinearMPC(TASK), window(helix, 0, N)
+    expected = decide_once(controller, AWAY, rows).command
+    fixed = rows.copy()
+    fixed.flags.writeable = False
+    lists = (
+        [AWAY.tolist()],
+        [fixed],
+        np.full((1, 8), HOVER)[:, ::2],
+        np.zeros((1, 6), np.float32),
+        np.zeros((1, 101)),
+    )
+    np.testing.assert_array_equal(controller.decide(*lists).command, expected)
 
 
 def test_window_past_the_horizon_is_not_read():
