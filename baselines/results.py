@@ -113,32 +113,57 @@ def discard(folder: Path) -> None:
 def locked(folder: Path) -> Iterator[None]:
     """Hold the folder for one sweep; makes it if need be.
 
+    The operating system holds the lock on the open file and drops it when the process ends, however it ends.
+    The file stays: were it removed, one process could hold the old file and another the new one. Its text is
+    there for the message only.
+
     Raises:
         ResultsError: If another process holds it, or it cannot be made.
     """
     path = folder / _LOCK
-    owner = {"pid": os.getpid(), "host": socket.gethostname()}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _remove_stale(path)
-        with open(path, "x") as file:
-            json.dump(owner, file)
+        file = open(path, "a+", encoding="utf-8")
     except FileExistsError as error:
-        held = _owner(path)
-        if not folder.is_dir():
-            raise ResultsError(f"{str(folder)!r} is a file, not a folder; choose another one") from error
-        raise ResultsError(
-            f"{str(folder)!r} is in use by process {held.get('pid', '?')} on {held.get('host', '?')}; "
-            f"wait for it, choose another folder, or delete {str(path)!r} if no sweep is running"
-        ) from error
+        raise ResultsError(f"{str(folder)!r} is a file, not a folder; choose another one") from error
     except OSError as error:
         raise ResultsError(
             f"cannot write into {str(folder)!r}: {error.strerror or error}; choose another folder"
         ) from error
-    try:
-        yield
-    finally:
-        path.unlink(missing_ok=True)
+    with file:
+        try:
+            _acquire(file.fileno())
+        except (BlockingIOError, PermissionError) as error:
+            held = _owner(path)
+            raise ResultsError(
+                f"{str(folder)!r} is in use by process {held.get('pid', '?')} on {held.get('host', '?')}; "
+                "wait for it, or choose another folder"
+            ) from error
+        except OSError as error:
+            raise ResultsError(
+                f"cannot lock {str(path)!r}: {error.strerror or error}; choose a folder on another disk"
+            ) from error
+        file.truncate(0)
+        json.dump({"pid": os.getpid(), "host": socket.gethostname()}, file)
+        file.flush()
+        try:
+            yield
+        finally:
+            with suppress(OSError):
+                file.truncate(0)
+
+
+def _acquire(descriptor: int) -> None:
+    """Lock an open file at once, or raise."""
+    if sys.platform == "win32":
+        import msvcrt
+
+        os.lseek(descriptor, 1 << 30, os.SEEK_SET)  # a byte far behind the text, which others may read
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def _owner(path: Path) -> dict[str, Any]:
@@ -147,27 +172,6 @@ def _owner(path: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}
-
-
-def _remove_stale(path: Path) -> None:
-    """Remove the lock of a process of this machine that is no more."""
-    owner = _owner(path)
-    if os.name != "posix":
-        return  # elsewhere os.kill(pid, 0) ends the process
-    if owner.get("host") != socket.gethostname() or not isinstance(owner.get("pid"), int):
-        return
-    try:
-        os.kill(owner["pid"], 0)
-    except ProcessLookupError:
-        # Of several processes that see the stale lock, only one succeeds in moving it away.
-        aside = path.with_name(f"{_LOCK}.{os.getpid()}")
-        try:
-            os.rename(path, aside)
-        except FileNotFoundError:
-            return
-        aside.unlink(missing_ok=True)
-    except OSError:
-        return  # alive, and another user's
 
 
 def provenance() -> dict[str, Any]:

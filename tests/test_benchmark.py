@@ -6,7 +6,6 @@ import csv
 import errno
 import json
 import os
-import socket
 import subprocess
 import sys
 from dataclasses import replace
@@ -75,7 +74,7 @@ def test_every_policy_flies_in_every_environment_from_the_same_seeds(finished):
 def test_the_folder_holds_configuration_results_summary_and_flights(finished):
     results, folder = finished
     assert sorted(path.name for path in folder.iterdir()) == [
-        "cells", "config.json", "episodes", "results.csv", "summary.csv",
+        ".lock", "cells", "config.json", "episodes", "results.csv", "summary.csv",
     ]  # fmt: skip
     config = json.loads((folder / "config.json").read_text())
     assert config["suite"]["episodes"] == 3 and "numba" in config["versions"] and "git_revision" in config
@@ -116,7 +115,7 @@ def test_an_interrupted_sweep_goes_on_where_it_stopped(tmp_path, flown, finished
 
     with pytest.raises(KeyboardInterrupt):
         run_benchmark(SMALL, tmp_path, on_unit=interrupt)
-    assert len(flown) == 2 and not (tmp_path / "results.csv").exists() and not (tmp_path / ".lock").exists()
+    assert len(flown) == 2 and not (tmp_path / "results.csv").exists()
     results = run_benchmark(SMALL, tmp_path)
     assert len(flown) == 4 and len(set(flown)) == 4
     assert without_times(results.rows()) == without_times(finished[0].rows())
@@ -151,23 +150,33 @@ def test_results_of_other_sources_are_not_mixed(tmp_path, monkeypatch):
 def test_a_folder_in_use_is_refused(tmp_path):
     with locked(tmp_path), pytest.raises(ResultsError, match=f"in use by process {os.getpid()}"):
         run_benchmark(SMALL, tmp_path)
-    assert not (tmp_path / ".lock").exists()
+    with locked(tmp_path):  # free again
+        pass
 
 
-def test_the_lock_of_a_process_that_is_no_more_is_removed(tmp_path):
-    gone = subprocess.Popen([sys.executable, "-c", ""])
-    gone.wait()
-    (tmp_path / ".lock").write_text(json.dumps({"pid": gone.pid, "host": socket.gethostname()}))
+def test_a_folder_is_free_when_its_process_was_killed(tmp_path):
+    code = (
+        "import sys, time; from pathlib import Path; from baselines.results import locked\n"
+        "with locked(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE) as process:
+        assert process.stdout.readline() == b"held\n"
+        with pytest.raises(ResultsError, match=f"in use by process {process.pid} on "), locked(tmp_path):
+            pass
+        process.kill()
     with locked(tmp_path):
         assert json.loads((tmp_path / ".lock").read_text())["pid"] == os.getpid()
-    assert list(tmp_path.iterdir()) == []
 
 
-def test_the_lock_of_another_machine_stays(tmp_path):
-    (tmp_path / ".lock").write_text(json.dumps({"pid": 1, "host": "elsewhere"}))
-    with pytest.raises(ResultsError, match="process 1 on elsewhere"), locked(tmp_path):
+def test_the_lock_is_that_of_an_open_file_and_not_of_its_name(tmp_path):
+    """Were the file removed at the end, one process could hold the old one and another the new one."""
+    with locked(tmp_path):
+        before = (tmp_path / ".lock").stat().st_ino
+    with locked(tmp_path):
+        assert (tmp_path / ".lock").stat().st_ino == before
+    (tmp_path / ".lock").write_text(json.dumps({"pid": 1, "host": "elsewhere"}))  # says so, holds nothing
+    with locked(tmp_path):
         pass
-    assert (tmp_path / ".lock").exists()
 
 
 def test_a_file_in_place_of_the_folder_is_refused(tmp_path):
