@@ -23,6 +23,7 @@ from .results import (
     plain_json,
     provenance,
     read_json,
+    refuse_foreign,
     source_digest,
     write_atomic,
     write_csv,
@@ -130,6 +131,7 @@ def _begin(folder: Path | None, suite: Suite, units: Sequence[Unit]) -> dict[int
     """Write config.json, or check that it is this suite's; the finished units by index."""
     if folder is None:
         return {}
+    refuse_foreign(folder)
     config = folder / "config.json"
     if not config.exists():
         write_json(config, {"suite": plain_json(suite.to_dict()), **provenance()})

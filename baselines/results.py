@@ -32,6 +32,7 @@ import quad_envs
 from .errors import ResultsError
 
 _LOCK = ".lock"
+_RESULTS = ("results.csv", "summary.csv", "cells/*.json", "episodes/*.npz")
 _DISTRIBUTIONS = ("gymnasium", "pettingzoo", "numpy", "scipy", "numba", "osqp", "joblib")
 
 
@@ -88,7 +89,8 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise ResultsError(f"cannot read {str(path)!r}: {error}; delete it to fly this unit again") from error
+        remedy = "choose another folder" if path.name == "config.json" else "delete it to fly this unit again"
+        raise ResultsError(f"cannot read {str(path)!r}: {error}; {remedy}") from error
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -103,10 +105,38 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def discard(folder: Path) -> None:
-    """Delete the results of an earlier run, and nothing else."""
-    for pattern in ("config.json", "results.csv", "summary.csv", "cells/*.json", "episodes/*.npz"):
+    """Delete the results of an earlier run, and nothing else.
+
+    Raises:
+        ResultsError: If the folder holds files of these names that no run of ours has written.
+    """
+    refuse_foreign(folder)
+    for pattern in (*_RESULTS, "config.json"):  # config.json last: it says whose the others are
         for path in folder.glob(pattern):
             path.unlink()
+
+
+def refuse_foreign(folder: Path) -> None:
+    """Check that what a run would overwrite in a folder is from an earlier run.
+
+    Raises:
+        ResultsError: If config.json is not ours, or there are results without one.
+    """
+    config = folder / "config.json"
+    if config.exists():
+        found = read_json(config)
+        if isinstance(found, dict) and isinstance(found.get("suite"), dict) and "source" in found:
+            return
+        what = "config.json"
+    else:
+        names = [path.relative_to(folder) for pattern in _RESULTS for path in folder.glob(pattern)]
+        if not names:
+            return
+        what = str(min(names))
+    raise ResultsError(
+        f"{str(folder)!r} holds a {what} that no benchmark has written; choose another folder, "
+        "or move it away"
+    )
 
 
 @contextmanager

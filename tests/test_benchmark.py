@@ -134,6 +134,17 @@ def test_a_fresh_run_discards_what_the_folder_holds_and_nothing_else(tmp_path, f
     assert len(flown) == 8 and (tmp_path / "notes.txt").exists()
 
 
+@pytest.mark.parametrize("fresh", [False, True])
+@pytest.mark.parametrize(
+    ("name", "text"), [("config.json", '{"mine": 1}'), ("config.json", "[1]"), ("results.csv", "a,b")]
+)
+def test_files_of_these_names_that_are_not_ours_are_left_alone(tmp_path, name, text, fresh, flown):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ResultsError, match=f"holds a {name} that no benchmark has written"):
+        run_benchmark(SMALL, tmp_path, fresh=fresh)
+    assert (tmp_path / name).read_text() == text and not flown
+
+
 def test_another_suite_in_the_same_folder_is_refused(tmp_path):
     run_benchmark(SMALL, tmp_path)
     with pytest.raises(ResultsError, match=r"holds another suite \(it differs in episodes, seed\)"):
