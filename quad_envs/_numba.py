@@ -17,7 +17,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
-from numba.core import event
+from numba.core import config, event
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import register_pass
 from numba.core.registry import CPUDispatcher
@@ -89,11 +89,15 @@ def _source_stamp() -> tuple[tuple[str, float, int], ...]:
 
 def kernel(function: Function) -> Function:
     """Compile on first call; division follows IEEE 754. Call it with every argument given."""
+    if getattr(config, "DISABLE_JIT", False):
+        return function
     return cast(Function, _Kernel(function, inline=False))
 
 
 def inline_kernel(function: Function) -> Function:
     """As `kernel`, but LLVM always inlines it into its caller, so that loops around it vectorise."""
+    if getattr(config, "DISABLE_JIT", False):
+        return function
     return cast(Function, _Kernel(function, inline=True))
 
 

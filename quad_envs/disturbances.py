@@ -13,6 +13,7 @@ from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
+from .names import unknown_name
 from .parameters import Array
 
 _Vector = tuple[float, float, float]
@@ -156,4 +157,6 @@ def make_disturbance(what: str | Disturbance | None) -> Disturbance | None:
         return _BY_NAME[what]()
     if isinstance(what, Disturbance):
         return what
-    raise ValueError(f"disturbance must be None, one of {sorted(_BY_NAME)}, or a Disturbance; got {what!r}")
+    if isinstance(what, str):
+        raise ValueError(unknown_name("disturbance", what, ["none", *_BY_NAME]))
+    raise ValueError(f"disturbance must be None, a name or a Disturbance, got {what!r}")

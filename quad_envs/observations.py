@@ -4,7 +4,7 @@
 |---|---|---|
 | own | 18 | V_B 3, phi, theta, sin psi, cos psi, Omega 3, rotor forces 4, last command 4 |
 | position | 3 | p, only where the task limits the position |
-| disturbance | 6 | torque (body, N m) and force (inertial, N) over the coming period, only where revealed |
+| disturbance | 6 | torque (body, N m), force (inertial, N) in the middle of the period, where revealed |
 | preview | 8 (preview + 1) | p_ref - p 3, v_ref 3, sin psi_ref, cos psi_ref for k..k+preview |
 """
 

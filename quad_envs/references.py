@@ -17,6 +17,7 @@ from typing import ClassVar, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .names import unknown_name
 from .observations import N_REFERENCE
 from .parameters import Array
 
@@ -150,7 +151,6 @@ class Racetrack:
         slope = -(r ** (n + 1)) * (np.abs(s) ** (n - 2) * s * c - np.abs(c) ** (n - 2) * c * s)
         a, b, h = self.length, self.width, self.height
         p = np.stack([a * r * c, b * r * s, h * np.sin(0.5 * w * t)], axis=1)
-        climb = 0.5 * h * np.cos(0.5 * w * t)
         climb = 0.5 * h * np.cos(0.5 * w * t)
         v = np.stack([a * (slope * c - r * s), b * (slope * s + r * c), climb], axis=1)
         return pack_rows(p, w * v)
@@ -308,6 +308,8 @@ def from_csv(path: str | Path, *, max_gap: float = 1.0) -> Reference:
     with Path(path).open(newline="", encoding="utf-8-sig") as file:
         lines = list(csv.reader(file))
     names = [name.strip() for name in lines[0]] if lines else []
+    if len(set(names)) < len(names):
+        raise ValueError(f"{path}: the header names a column twice: {', '.join(names)}")
     missing = [name for name in _CSV_COLUMNS[:4] if name not in names]
     unknown = [name for name in names if name not in _CSV_COLUMNS]
     if missing or unknown:
@@ -379,13 +381,12 @@ def make_reference(what: str | Reference) -> Reference:
     Raises:
         ValueError: If it is none of these.
     """
+    if isinstance(what, Reference):
+        return what
     if isinstance(what, str):
         if what in _BY_NAME:
             return _BY_NAME[what]()
         if what.endswith(".csv"):
             return from_csv(what)
-    elif isinstance(what, Reference):
-        return what
-    raise ValueError(
-        f"reference must be one of {sorted(_BY_NAME)}, a path ending in .csv, or a Reference; got {what!r}"
-    )
+        raise ValueError(f"{unknown_name('reference', what, _BY_NAME)}, or a path ending in .csv")
+    raise ValueError(f"reference must be a name, a path ending in .csv or a Reference, got {what!r}")

@@ -117,6 +117,7 @@ def test_csv_is_reproduced_at_its_lines_and_rests_after_its_end(tmp_path):
         ("t,x,y,z\n0,0,0,0\n", "at least two lines"),
         ("t,x,y,z,vx\n0,0,0,0,0\n1,0,0,0,0\n", "all of vx, vy, vz"),
         ("", "header"),
+        ("t,x,y,z,x\n0,0,0,0,0\n1,0,0,0,0\n", "twice"),
     ],
 )
 def test_a_broken_csv_is_refused_with_its_line(tmp_path, text, message):
@@ -125,5 +126,5 @@ def test_a_broken_csv_is_refused_with_its_line(tmp_path, text, message):
 
 
 def test_unknown_reference_name_lists_the_known_ones():
-    with pytest.raises(ValueError, match="helix"):
+    with pytest.raises(ValueError, match="did you mean 'helix'"):
         make_reference("hleix")

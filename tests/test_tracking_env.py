@@ -1,7 +1,10 @@
 """The single tracking environment: reward, limits, observation, disturbances, reset and bad input."""
 
 import math
+import os
 import pickle
+import subprocess
+import sys
 
 import gymnasium as gym
 import numpy as np
@@ -76,7 +79,7 @@ def test_reward_and_stage_cost_are_the_readable_formulas():
 
 def test_episode_cost_is_the_running_sum_of_cost():
     infos = [info for _, _, info, _, _ in flight(make(**LIMITS))]
-    costs = [info["cost"] for info in infos]
+    costs = [0.0, *(info["cost"] for info in infos[1:])]  # of the steps, not of the start
     np.testing.assert_allclose([info["episode_cost"] for info in infos], np.cumsum(costs))
 
 
@@ -278,6 +281,15 @@ def test_quadratic_reward_is_minus_cost_and_penalty():
         ({"substeps": 0}, ValueError, "substeps"),
         ({"preview": 2.5}, ValueError, "preview"),
         ({"time_limit": 0.01}, ValueError, "time_limit"),
+        ({"time_limit": 0.07}, ValueError, "whole control periods"),
+        ({"time_limit": 1e12}, ValueError, "time_limit"),
+        ({"position_limit": 3}, ValueError, "position_limit must be None or"),
+        ({"inertia": 5}, ValueError, "inertia must be three numbers"),
+        ({"inertia": ("a", 1, 2)}, ValueError, "inertia must be three numbers"),
+        ({"start": 1.0}, ValueError, "start must be 3"),
+        ({"start_box": (0.0,) * 6 + (2.0,) + (0.0,) * 5}, ValueError, "start roll and pitch"),
+        ({"reveal_disturbance": "no"}, ValueError, "reveal_disturbance"),
+        ({"randomize": {"mass": 0.3}, "kappa": 0.3125}, ValueError, "too weak to hover"),
         ({"reward": "sparse"}, ValueError, "reward"),
         ({"start": (1.0, 2.0)}, ValueError, "start"),
         ({"start": (0.0,) * 6 + (1.5,) + (0.0,) * 5}, ValueError, "start roll"),
@@ -321,3 +333,64 @@ def test_golden_numbers_of_a_flight_with_everything_random():
     np.testing.assert_allclose(observation[:3], [0.07626344, 0.21043235, -0.33809412], rtol=1e-6)
     assert score == pytest.approx(0.8716968022949528, rel=1e-8)
     assert info["stage_cost"] == pytest.approx(7.096195468714849, rel=1e-8)
+
+
+def test_steps_past_the_time_limit_see_the_last_window_and_nothing_else():
+    env = make(time_limit=0.5, preview=3, lost_distance=1e6).unwrapped
+    env.reset(seed=0)
+    rows = env.task.layout.slices["preview"]
+    for _ in range(30):
+        observation = env.step(np.zeros(4, np.float32))[0]
+    window = observation[rows].reshape(4, 8)
+    expected = env.reference[-4:].copy()
+    expected[:, :3] -= env.state[:3]
+    np.testing.assert_allclose(window, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_step_before_reset_is_refused():
+    with pytest.raises(gym.error.ResetNeeded):
+        make().unwrapped.step(np.zeros(4, np.float32))
+
+
+def test_a_start_that_is_lost_already_is_refused():
+    env = make(start=(100.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="beyond lost_distance"):
+        env.reset(seed=0)
+
+
+class _Wrong:
+    random = False
+
+    def __init__(self, values):
+        self.made = values
+
+    def values(self, t, rng):
+        return self.made(t)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [(lambda t: np.zeros((1, 1, 6)), "shape"), (lambda t: np.full((*t.shape, 6), np.nan), "not finite")],
+)
+def test_a_disturbance_of_the_user_is_checked(values, message):
+    with pytest.raises(ValueError, match=message):
+        make(disturbance=_Wrong(values))
+
+
+def test_kernels_run_as_plain_python_for_debugging():
+    code = (
+        "import gymnasium as gym, numpy as np, quad_envs\n"
+        "env = gym.make('quad/HelixTracking-v0', preview=2, time_limit=0.1)\n"
+        "print(env.reset(seed=0)[0].sum() + env.step(np.full(4, .1, 'f4'))[0].sum())"
+    )
+    runs = [
+        subprocess.run(
+            [sys.executable, "-c", code],
+            capture_output=True,
+            text=True,
+            check=True,
+            env={**os.environ, "NUMBA_DISABLE_JIT": flag},
+        ).stdout
+        for flag in "01"
+    ]
+    assert float(runs[0]) == pytest.approx(float(runs[1]), rel=1e-6)

@@ -95,6 +95,27 @@ def test_without_autoreset_a_masked_reset_begins_only_the_chosen_rows():
     assert infos["episode_cost"].shape == (3,)
 
 
+def test_rows_that_are_not_reset_show_their_present_observation():
+    vector = gym.make_vec("quad/HelixTracking-v0", num_envs=2)
+    vector.reset(seed=0)
+    for _ in range(5):
+        stepped = vector.step(np.full((2, 4), 0.1, np.float32))[0]
+    observations, _ = vector.reset(options={"reset_mask": np.array([True, False])})
+    assert np.array_equal(observations[1], stepped[1]) and not np.array_equal(observations[0], stepped[0])
+
+
+def test_the_first_reset_cannot_be_partial():
+    vector = gym.make_vec("quad/HelixTracking-v0", num_envs=2)
+    with pytest.raises(ValueError, match="first reset"):
+        vector.reset(options={"reset_mask": np.array([True, False])})
+
+
+def test_start_states_need_one_row_per_flight():
+    vector = gym.make_vec("quad/HelixTracking-v0", num_envs=3)
+    with pytest.raises(ValueError, match="3 rows"):
+        vector.reset(options={"state": np.zeros((2, 12))})
+
+
 def test_observations_and_infos_share_no_memory_between_calls():
     vector = gym.make_vec("quad/HelixTracking-v0", num_envs=3, rate_limit=1.0)
     first, infos = vector.reset(seed=0)

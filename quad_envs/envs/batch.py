@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..disturbances import Disturbance, make_disturbance
 from ..observations import N_REFERENCE
-from ..parameters import N_STATE, Array
+from ..parameters import N_STATE, POSITION, Array
 from ..references import Reference, make_reference
 from .kernel import (
     COEFFICIENTS,
@@ -21,6 +21,7 @@ from .kernel import (
     PLANT,
     ROW_SIZE,
     SCRATCH_SIZE,
+    begin_row,
     observe_row,
     step_rows,
     task_vector,
@@ -60,7 +61,7 @@ class TrackingBatch:
         if not random[0]:
             self.references[0] = self._reference_rows(never)
         if self._disturbance is not None and not random[1]:
-            self.disturbances[0] = self._disturbance.values(self._nodes, never)
+            self.disturbances[0] = self._disturbance_rows(self._disturbance, never)
         self._random = random
         self._which: NDArray[np.int64] = np.zeros((3, n), dtype=np.int64)
         for table in range(3):
@@ -100,10 +101,21 @@ class TrackingBatch:
         if self._random[0]:
             self.references[i] = self._reference_rows(rng)
         if self._disturbance is not None and self._random[1]:
-            self.disturbances[i] = self._disturbance.values(self._nodes, rng)
+            self.disturbances[i] = self._disturbance_rows(self._disturbance, rng)
         if self._random[2]:
             rng.standard_normal(out=self.noises[i])
             self.noises[i] *= self._noise
+        distance = float(np.linalg.norm(row[POSITION] - self.references[self._which[0, i], 0, POSITION]))
+        if distance > self.options.lost_distance:
+            raise ValueError(
+                f"the start is {distance:.3g} m from the reference, beyond lost_distance = "
+                f"{self.options.lost_distance:g} m; move the start or the reference, or raise lost_distance"
+            )
+        begin_row(self.rows, i, self.references[self._which[0, i]], self._vector)
+        self.observe(i, out)
+
+    def observe(self, i: int, out: NDArray[np.float32]) -> None:
+        """Write the present observation of row i, (layout.size,) float32."""
         observe_row(
             self.rows,
             i,
@@ -155,6 +167,18 @@ class TrackingBatch:
         if not np.isfinite(rows).all():
             k = int(np.argmin(np.isfinite(rows).all(axis=1)))
             raise ValueError(f"reference {self._reference!r} is not finite at t = {self._times[k]:g} s")
+        return rows
+
+    def _disturbance_rows(self, disturbance: Disturbance, rng: np.random.Generator) -> Array:
+        rows = np.asarray(disturbance.values(self._nodes, rng), dtype=np.float64)
+        if rows.shape != (*self._nodes.shape, 6):
+            raise ValueError(
+                f"disturbance {disturbance!r} must give values of shape {(*self._nodes.shape, 6)}, "
+                f"got {rows.shape}"
+            )
+        if not np.isfinite(rows).all():
+            k = int(np.argmin(np.isfinite(rows).all(axis=(1, 2))))
+            raise ValueError(f"disturbance {disturbance!r} is not finite at t = {k * self.task.dt:g} s")
         return rows
 
     def _draw_vehicle(self, rng: np.random.Generator) -> tuple[Array, float]:

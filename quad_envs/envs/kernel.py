@@ -123,7 +123,6 @@ def _judge(row: Array, reference: Array, previous: Array, finite: bool, task: Ar
         row[REWARD] = 0.0 if crashed else (1.0 - v) / (1.0 + stage_cost)
     row[STAGE_COST] = stage_cost
     row[COST] = cost
-    row[EPISODE_COST] += cost
     row[VIOLATED] = 1.0 if cost > 0.0 else 0.0
     row[CRASHED] = 1.0 if crashed else 0.0
     row[TRUNCATED] = 1.0 if row[STEP] >= task[_EPISODE_STEPS] and not crashed else 0.0
@@ -169,7 +168,8 @@ def observe(
             for i in range(6):
                 out[start + i] = disturbance[k, disturbance.shape[1] // 2, i]
         start += 6
-    encode_preview(out, start, reference, k, int(task[_PREVIEW]) + 1, measured)
+    stages = int(task[_PREVIEW]) + 1
+    encode_preview(out, start, reference, min(k, reference.shape[0] - stages), stages, measured)
 
 
 @inline_kernel
@@ -241,8 +241,16 @@ def step_rows(
             reference = references[which[0, i]]
             k = min(int(row[STEP]), reference.shape[0] - 1)
             _judge(row, reference[k], previous[j], finite, task)
+            row[EPISODE_COST] += row[COST]
             observe(row, reference, disturbances[which[1, i]], noises[which[2, i]], task, measured, out[i])
     return -1
+
+
+@kernel
+def begin_row(rows: Array, i: int, reference: Array, task: Array) -> None:
+    """Stage cost and constraint values of row i after a reset, with no command change yet."""
+    row = rows[i]
+    _judge(row, reference[0], row[COMMAND], True, task)
 
 
 @kernel
@@ -257,16 +265,8 @@ def observe_row(
     scratch: Array,
     out: NDArray[np.float32],
 ) -> None:
-    """Observation of row i as it stands, after a reset; also its stage cost, with no command change yet."""
-    row = rows[i]
-    reference = references[which[0, i]]
-    _judge(row, reference[int(row[STEP])], row[COMMAND], True, task)
+    """Observation of row i as it stands."""
+    measured = scratch[scratch.size - 16 :]
     observe(
-        row,
-        reference,
-        disturbances[which[1, i]],
-        noises[which[2, i]],
-        task,
-        scratch[scratch.size - 16 :],
-        out,
+        rows[i], references[which[0, i]], disturbances[which[1, i]], noises[which[2, i]], task, measured, out
     )

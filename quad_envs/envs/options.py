@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -11,6 +10,7 @@ from typing import Any, TypedDict
 import numpy as np
 
 from ..disturbances import Disturbance, make_disturbance
+from ..names import unknown_name
 from ..observations import TrackingLayout
 from ..parameters import N_STATE, Array, Limits, QuadrotorParams, Weights
 from ..references import Reference, make_reference
@@ -21,6 +21,7 @@ _NUMBERS = (
     *("mass", "gravity", "arm", "yaw_moment", "rotor_rate", "drag", "kappa", "rate_limit", "tilt_limit"),
     *("velocity_limit", "dt", "time_limit", "lost_distance"),
 )
+_MOST_STEPS = 1_000_000  # control periods of an episode; its tables are made at reset
 RANDOMIZABLE = ("mass", "inertia", "arm", "kappa", "rotor_rate", "drag")
 _Triple = tuple[float, float, float]
 
@@ -99,8 +100,25 @@ class TrackingOptions:
             value = getattr(self, name)
             if not (_is_number(value) and value > 0.0):
                 raise ValueError(f"{name} must be a finite number > 0, got {value!r}")
-        if self.time_limit < self.dt:
-            raise ValueError(f"time_limit must be at least dt = {self.dt} s, got {self.time_limit!r} s")
+        steps = self.time_limit / self.dt
+        if not 1.0 <= steps <= _MOST_STEPS or abs(steps - round(steps)) > 1e-6 * steps:
+            raise ValueError(
+                f"time_limit must be 1 to {_MOST_STEPS} whole control periods of dt = {self.dt} s, "
+                f"got {self.time_limit!r} s"
+            )
+        if not isinstance(self.reveal_disturbance, bool | np.bool_):
+            raise ValueError(f"reveal_disturbance must be True or False, got {self.reveal_disturbance!r}")
+        if not _is_vector(self.inertia):
+            raise ValueError(f"inertia must be three numbers (Jx, Jy, Jz), got {self.inertia!r}")
+        if self.position_limit is not None and not (
+            isinstance(self.position_limit, tuple)
+            and len(self.position_limit) == 2
+            and all(map(_is_vector, self.position_limit))
+        ):
+            raise ValueError(
+                "position_limit must be None or ((x, y, z) lower, (x, y, z) upper), "
+                f"got {self.position_limit!r}"
+            )
         for name in ("substeps", "preview"):
             value = getattr(self, name)
             least = 1 if name == "substeps" else 0
@@ -126,9 +144,7 @@ class TrackingOptions:
         known = [field.name for field in fields(cls)]
         for name in kwargs:
             if name not in known:
-                near = difflib.get_close_matches(name, known, n=1)
-                hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known[1:])}"
-                raise TypeError(f"unknown keyword argument {name!r} for a tracking environment; {hint}")
+                raise TypeError(unknown_name("keyword argument of a tracking environment", name, known[1:]))
         return cls(**{name: _as_tuple(value) for name, value in kwargs.items()})
 
     def make_task(self) -> Task:
@@ -170,13 +186,19 @@ class TrackingOptions:
 
     def start_state(self) -> Array:
         """Middle of the start box, (12,)."""
-        if len(self.start) not in (3, N_STATE) or not all(map(_is_number, self.start)):
+        if (
+            not isinstance(self.start, tuple)
+            or len(self.start) not in (3, N_STATE)
+            or not all(map(_is_number, self.start))
+        ):
             raise ValueError(f"start must be 3 (position) or 12 (state) finite numbers, got {self.start!r}")
         state = np.zeros(N_STATE)
         state[: len(self.start)] = self.start
-        if abs(state[6]) >= CRASH_TILT or abs(state[7]) >= CRASH_TILT:
+        tilt, width = np.abs(state[6:8]), self.start_half_widths()[6:8]
+        if (tilt + width >= CRASH_TILT).any():
             raise ValueError(
-                f"start roll and pitch must be below {CRASH_TILT:.4f} rad, got {state[6:8].tolist()}"
+                f"start roll and pitch with their box must stay below {CRASH_TILT:.4f} rad, "
+                f"got {tilt.tolist()} +- {width.tolist()}"
             )
         return state
 
@@ -211,7 +233,7 @@ class TrackingOptions:
                 raise ValueError(
                     "randomize['drag'] varies the drag in proportion: give the env a drag > 0 first"
                 )
-        if self.kappa * (1.0 - spread.get("kappa", 0.0)) <= 0.25:
+        if self.kappa * (1.0 - spread.get("kappa", 0.0)) <= 0.25 * (1.0 + spread.get("mass", 0.0)):
             raise ValueError(
                 f"randomize={self.randomize!r} would draw rotors too weak to hover at kappa = {self.kappa}"
             )
@@ -223,6 +245,15 @@ CRASH_TILT = math.radians(85.0)  # rad; the Euler rates are singular at 90 degre
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float | np.integer | np.floating) and math.isfinite(value)
+
+
+def _is_vector(value: object) -> bool:
+    """Whether it is three numbers, possibly infinite."""
+    return (
+        isinstance(value, tuple)
+        and len(value) == 3
+        and all(isinstance(entry, int | float | np.integer | np.floating) for entry in value)
+    )
 
 
 def _as_tuple(value: Any) -> Any:

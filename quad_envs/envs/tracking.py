@@ -130,6 +130,8 @@ class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Hold the rotor commands over one control period."""
+        if self._np_random is None:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
         actions = np.asarray(action, dtype=np.float32)
         if actions.shape != (4,):
             raise ValueError(f"action must have shape (4,), one entry per rotor, got {actions.shape}")

@@ -77,7 +77,6 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.floa
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._generators: list[np.random.Generator] = []
         self._done = np.zeros(num_envs, dtype=np.bool_)
-        self._last: Observations = self._fresh_observations()
 
     @property
     def task(self) -> Task:
@@ -108,23 +107,18 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.floa
         mask = np.asarray(given.pop("reset_mask", np.ones(self.num_envs)), dtype=np.bool_)
         if mask.shape != (self.num_envs,):
             raise ValueError(f"reset_mask must have shape ({self.num_envs},), got {mask.shape}")
+        if not (mask.all() or self._generators):
+            raise ValueError("the first reset must begin all rows; reset_mask is for later ones")
+        states = self._given_states(given.pop("state", None))
         self._seed(seed, mask)
-        state = np.asarray(given.pop("state")) if "state" in given else None
         observations = self._fresh_observations()
         for i in range(self.num_envs):
             if mask[i]:
-                one = (
-                    dict(given)
-                    if state is None
-                    else {**given, "state": state if state.ndim == 1 else state[i]}
-                )
+                one = given if states is None else {**given, "state": states[i]}
                 self._batch.reset_row(i, self._generators[i], observations[i], one)
             else:
-                observations[i] = self._last[i]
+                self._batch.observe(i, observations[i])
         self._done[mask] = False
-        self._last = (
-            observations if self.autoreset_mode is not AutoresetMode.DISABLED else observations.copy()
-        )
         return observations, self._info()
 
     def step(self, actions: NDArray[np.float32]) -> _Step:
@@ -150,9 +144,21 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.floa
         info = self._info()
         if self.autoreset_mode is AutoresetMode.SAME_STEP and self._done.any():
             info = self._reset_in_same_step(observations, info)
-        elif self.autoreset_mode is AutoresetMode.DISABLED:
-            self._last = observations.copy()
         return observations, rewards, terminated, truncated, info
+
+    def _given_states(self, state: Any) -> Array | None:
+        """Start states from the reset options, one row per flight."""
+        if state is None:
+            return None
+        states = np.asarray(state, dtype=np.float64)
+        if states.ndim == 1:
+            states = np.tile(states, (self.num_envs, 1))
+        if states.ndim != 2 or len(states) != self.num_envs:
+            raise ValueError(
+                f"reset option 'state' must be one state for all or {self.num_envs} rows, "
+                f"got shape {states.shape}"
+            )
+        return states
 
     def _reset_rows(self, which: Bools, observations: Observations) -> None:
         for i in np.flatnonzero(which).tolist():
