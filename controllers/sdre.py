@@ -183,7 +183,7 @@ class Lqr(Sdre):
     Args:
         task: What is known of the flight.
         frame: "heading" or "hover", see `LinearMPC`.
-        velocity_reference: "heading" or "attitude", see `LinearMPC`; the latter costs up to 3 times less here.
+        velocity_reference: "heading" or "attitude", see `LinearMPC`; "attitude" costs up to 3 times less.
 
     Raises:
         ValueError: If an option is not allowed.
