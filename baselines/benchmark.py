@@ -47,15 +47,16 @@ def fly_unit(unit: Unit) -> dict[str, Any]:
 
 def _saver(unit: Unit) -> Callable[[Episode], None]:
     """Writes each flight to episodes/."""
-    folder, stem = unit.episode_folder or Path(), unit.file_name.removesuffix(".json")
 
     def save(episode: Episode) -> None:
+        path = unit.episode_file(episode.seed)
+        assert path is not None
         arrays: dict[str, Any] = {
             key: value for key, value in episode._asdict().items() if isinstance(value, np.ndarray)
         }
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **arrays)
-        write_atomic(folder / f"{stem}-{episode.seed}.npz", buffer.getvalue())
+        write_atomic(path, buffer.getvalue())
 
     return save
 
@@ -73,7 +74,8 @@ def run_benchmark(
     """Fly every policy of a suite in every environment, from the same starts.
 
     An interrupted run goes on where it stopped when it is called again with the same folder: each finished
-    unit (environment x policy) is stored at once. Decision times mean something with jobs = 1, or idle cores.
+    unit (environment x policy) is stored at once; one whose flights are asked for and were not saved is flown
+    again. Decision times mean something with jobs = 1, or idle cores.
 
     Args:
         suite: Name of a shipped suite, path of a TOML file, mapping, or Suite.
@@ -153,7 +155,8 @@ def _begin(folder: Path | None, suite: Suite, units: Sequence[Unit]) -> dict[int
 
 
 def _stored_units(folder: Path, units: Sequence[Unit]) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Units that have their cell and every flight that is asked for."""
     for unit in units:
         path = folder / "cells" / unit.file_name
-        if path.exists():
+        if path.exists() and all(file.exists() for file in unit.episode_files()):
             yield unit.number, read_json(path)

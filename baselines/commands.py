@@ -91,12 +91,13 @@ def evaluate_one(options: EvaluateOptions) -> int:
 
     env_kwargs = read_assignments("--set", options.set)
     policy_kwargs = read_assignments("--policy-set", options.policy_set)
-    if options.save_episodes and options.out is None:
-        raise ValueError("--save-episodes needs a folder: --out FOLDER")
+    for flag, given in (("--save-episodes", options.save_episodes), ("--fresh", options.fresh)):
+        if given and options.out is None:
+            raise ValueError(f"{flag} needs a folder: --out FOLDER")
     if options.out is not None:
         choices = (EnvChoice(options.env, env_kwargs),), (PolicyChoice(options.policy, policy_kwargs),)
         suite = Suite("evaluate", *choices, options.episodes, options.seed)
-        results = run_benchmark(suite, options.out, save_episodes=options.save_episodes)
+        results = run_benchmark(suite, options.out, save_episodes=options.save_episodes, fresh=options.fresh)
         found = results.evaluations[0]
         say(f"results in {options.out}")
     else:

@@ -41,6 +41,7 @@ class EvaluateOptions:
     policy_set: Annotated[list[str], "option of the policy; JSON, else text"] = field(default_factory=list)
     json: Annotated[bool, "print JSON"] = False
     out: Annotated[Path | None, "results folder"] = None
+    fresh: Annotated[bool, "discard what the results folder holds of an earlier run"] = False
     save_episodes: Annotated[bool, "save every flight to the results folder"] = False
 
 

@@ -203,6 +203,16 @@ class Unit(NamedTuple):
         slug = "".join(c if c.isalnum() else "-" for c in f"{self.env.title}--{self.policy.title}")
         return f"{self.number:03d}-{slug[:80]}.json"
 
+    def episode_file(self, seed: int) -> Path | None:
+        """File of the flight with a seed; None if flights are not saved."""
+        stem = self.file_name.removesuffix(".json")
+        return None if self.episode_folder is None else self.episode_folder / f"{stem}-{seed}.npz"
+
+    def episode_files(self) -> list[Path]:
+        """Files of all its flights; none if flights are not saved."""
+        files = (self.episode_file(self.seed + i) for i in range(self.episodes))
+        return [file for file in files if file is not None]
+
 
 def suite_units(suite: Suite, episode_folder: Path | None = None) -> list[Unit]:
     """All environments x policies."""

@@ -81,6 +81,21 @@ def test_evaluate_leaves_a_results_folder(capsys, tmp_path):
     assert len(list((out / "episodes").iterdir())) == 2
 
 
+def test_flights_that_are_asked_for_later_are_flown_and_saved(tmp_path):
+    arguments = ["evaluate", HELIX, "hover", "--episodes", "2", "--out", str(tmp_path), "--json"]
+    assert main(arguments) == 0 and not (tmp_path / "episodes").exists()
+    assert main([*arguments, "--save-episodes"]) == 0
+    assert len(list((tmp_path / "episodes").iterdir())) == 2
+
+
+def test_evaluate_discards_another_run_if_asked_to(capsys, tmp_path):
+    arguments = ["evaluate", HELIX, "hover", "--out", str(tmp_path), "--episodes"]
+    assert main([*arguments, "2"]) == 0
+    capsys.readouterr()
+    assert "--fresh" in fails(capsys, *arguments, "1")
+    assert main([*arguments, "1", "--fresh"]) == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
