@@ -100,14 +100,35 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with _quiet_pipe():
         try:
             return command.run(read_options(command.options, found))
-        except (ValueError, TypeError) as error:
-            if os.environ.get("QUAD_ENVS_TRACEBACK"):
+        except BrokenPipeError:
+            raise
+        except Exception as error:
+            if os.environ.get("QUAD_ENVS_TRACEBACK") or not isinstance(error, _input_errors()):
                 raise
-            print(f"quad-envs: error: {error}", file=sys.stderr)
+            print(f"quad-envs: error: {_one_line(error)}", file=sys.stderr)
             return 2
         except KeyboardInterrupt:
             print("quad-envs: interrupted", file=sys.stderr)
             return _INTERRUPTED
+
+
+def _input_errors() -> tuple[type[Exception], ...]:
+    """What bad input raises; Gymnasium's own errors if it is loaded at all."""
+    kinds: tuple[type[Exception], ...] = (ValueError, TypeError, OSError, MemoryError, OverflowError)
+    gymnasium = sys.modules.get("gymnasium")
+    return kinds if gymnasium is None else (*kinds, gymnasium.error.Error)
+
+
+def _one_line(error: Exception) -> str:
+    """What is wrong, on one line and with the file or the cause where Python leaves it out."""
+    text = " ".join(str(error).split())
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    if isinstance(error, MemoryError):
+        return f"not enough memory: {text or 'choose smaller numbers'}"
+    if isinstance(error, OverflowError):
+        return f"a number is too large: {text}"
+    return text or type(error).__name__
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -149,7 +150,7 @@ def benchmark_suite(options: BenchmarkOptions) -> int:
 
 
 def _resume(options: BenchmarkOptions, out: Path) -> str:
-    words = ["quad-envs benchmark", options.suite, f"--out {out}"]
+    words = ["quad-envs benchmark", shlex.quote(options.suite), f"--out {shlex.quote(str(out))}"]
     for name in ("episodes", "seed"):
         value = getattr(options, name)
         words += [] if value is None else [f"--{name} {value}"]

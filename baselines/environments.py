@@ -45,12 +45,33 @@ def task_of(source: Any) -> Task:
             env.close()
     task = _find_task(source)
     if not isinstance(task, Task):
-        raise ValueError(
-            f"cannot find the task of {source!r}: give an environment of this suite (gymnasium.make, "
-            f"make_vec), one of the ids {', '.join(TRACKING)}, or a quad_envs.Task"
-        )
+        raise _no_task(source)
     _check_spaces(source, task)
     return task
+
+
+def require_own_task(env: Any) -> None:
+    """Check that an environment can be flown and measured: that it, and not a part of it, has the Task.
+
+    Raises:
+        ValueError: If not; it says what to use instead.
+    """
+    if isinstance(getattr(getattr(env, "unwrapped", env), "task", None), Task):
+        return
+    if isinstance(_find_task(env), Task):
+        raise ValueError(
+            f"a {type(env).__name__} hides the plants of its environments: use gymnasium.make_vec(..., "
+            'vectorization_mode="vector_entry_point"), its default for the ids of this suite, or a single '
+            "environment"
+        )
+    raise _no_task(env)
+
+
+def _no_task(source: Any) -> ValueError:
+    return ValueError(
+        f"cannot find the task of {source!r}: give an environment of this suite (gymnasium.make, "
+        f"make_vec), one of the ids {', '.join(TRACKING)}, or a quad_envs.Task"
+    )
 
 
 def _find_task(source: Any) -> Any:

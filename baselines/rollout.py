@@ -19,6 +19,7 @@ from quad_envs.observations import N_REFERENCE
 from quad_envs.parameters import Array
 from quad_envs.tasks import Task
 
+from .environments import require_own_task
 from .policy import N_FALLBACKS, Actions, Counts, Policy, PolicyState
 
 _SCORES = ("stage_cost", "cost", "constraint_violation")
@@ -122,13 +123,17 @@ def run_episodes(policy: Policy, env: Any, episodes: int, seed: int = 0) -> Iter
         env: A Gymnasium environment (each decision is timed), a vector environment (fast, not timed), or a
             PettingZoo ParallelEnv (one episode per agent, agents are rows of the observation).
         episodes: Number of episodes, >= 1.
-        seed: Seed of the first one.
+        seed: Seed of the first one, >= 0.
 
     Raises:
-        ValueError: If episodes < 1, or a vector environment resets in the same step.
+        ValueError: If episodes < 1, the seed < 0, the environment is not of this suite, or a vector
+            environment resets in the same step.
     """
     if isinstance(episodes, bool) or not isinstance(episodes, int | np.integer) or episodes < 1:
         raise ValueError(f"episodes must be a whole number >= 1, got {episodes!r}")
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise ValueError(f"seed must be a whole number >= 0, got {seed!r}")
+    require_own_task(env)
     if isinstance(env, VectorEnv):
         if env.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP:
             raise ValueError("autoreset_mode SAME_STEP hides the last state; use NEXT_STEP or DISABLED")

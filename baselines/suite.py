@@ -80,6 +80,9 @@ class Suite:
     compare_with: str = ""  # title of the policy from which differences are taken; the first if empty
 
     def __post_init__(self) -> None:
+        for name in ("name", "compare_with"):
+            if not isinstance(getattr(self, name), str):
+                raise ValueError(f"{name} of a suite must be text, got {getattr(self, name)!r}")
         for name, least in (("episodes", 1), ("seed", 0)):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
@@ -141,6 +144,8 @@ def _choices(
         )
     out = []
     for entry in entries:
+        if not isinstance(entry, str | Mapping):
+            raise ValueError(f"suite {suite!r}: choose by name or by a table with {key!r}, got {entry!r}")
         table: dict[str, Any] = {key: entry} if isinstance(entry, str) else dict(entry)
         for name in table:
             if name not in (key, "kwargs", "label"):
@@ -149,6 +154,15 @@ def _choices(
             raise ValueError(f"suite {suite!r}: each table needs {key!r}, got {table}")
         if table[key] not in every:
             raise ValueError(unknown_name(f"{key} in suite {suite!r}:", table[key], every))
+        if not isinstance(table.get("kwargs", {}), Mapping):
+            raise ValueError(
+                f"suite {suite!r}: kwargs of {table[key]!r} must be a table, as {{horizon = 15}}, "
+                f"got {table['kwargs']!r}"
+            )
+        if not isinstance(table.get("label", ""), str):
+            raise ValueError(
+                f"suite {suite!r}: the label of {table[key]!r} must be text, got {table['label']!r}"
+            )
         out.append(kind(**table))
     return tuple(out)
 
@@ -157,7 +171,9 @@ def suite_names() -> dict[str, str]:
     """Shipped suites and what they are."""
     files = sorted(resources.files("baselines").joinpath("suites").iterdir(), key=lambda file: file.name)
     toml = [file for file in files if file.name.endswith(".toml")]
-    return {file.name[:-5]: str(tomllib.loads(file.read_text()).get("description", "")) for file in toml}
+    return {
+        file.name[:-5]: str(tomllib.loads(file.read_text("utf-8")).get("description", "")) for file in toml
+    }
 
 
 def load_suite(source: str | Path | Mapping[str, Any] | Suite) -> Suite:
@@ -176,15 +192,23 @@ def load_suite(source: str | Path | Mapping[str, Any] | Suite) -> Suite:
             raise ValueError(
                 f"there is no suite file {str(path)!r}; shipped suites: {', '.join(suite_names())}"
             )
-        text = path.read_text()
-    elif str(source) in suite_names():
-        text = resources.files("baselines").joinpath("suites", f"{source}.toml").read_text()
-    else:
+        return _read_suite(path)
+    if str(source) not in suite_names():
         raise ValueError(unknown_name("suite", str(source), suite_names()) + "; or the path of a .toml file")
+    text = resources.files("baselines").joinpath("suites", f"{source}.toml").read_text("utf-8")
+    return suite_from_dict(tomllib.loads(text), path.stem)
+
+
+def _read_suite(path: Path) -> Suite:
+    """The suite of a file; every complaint names the file."""
     try:
-        return suite_from_dict(tomllib.loads(text), path.stem)
-    except tomllib.TOMLDecodeError as error:
+        return suite_from_dict(tomllib.loads(path.read_text("utf-8")), path.stem)
+    except OSError as error:
+        raise ValueError(f"cannot read suite file {str(path)!r}: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"suite file {str(path)!r} is not valid TOML: {error}") from error
+    except ValueError as error:
+        raise ValueError(f"suite file {str(path)!r}: {error}") from error
 
 
 class Unit(NamedTuple):

@@ -271,6 +271,10 @@ def test_a_suite_is_read_from_a_file(tmp_path):
         ({"seed": -1}, "seed of suite"),
         ({"envs": []}, "has no envs"),
         ({"envs": ["quad/Helix-v0"]}, "did you mean 'quad/HelixTracking-v0'"),
+        ({"envs": [3]}, "choose by name or by a table with 'id', got 3"),
+        ({"policies": [{"name": "hover", "kwargs": 3}]}, "kwargs of 'hover' must be a table.*got 3"),
+        ({"policies": [{"name": "hover", "label": 3}]}, "label of 'hover' must be text, got 3"),
+        ({"name": 3}, "name of a suite must be text, got 3"),
         ({"envs": "some"}, 'list of tables with .id., or "all"'),
         ({"policies": [{"kwargs": {}}]}, "each table needs 'name'"),
         ({"policies": [{"name": "hover", "kwarg": {}}]}, "did you mean 'kwargs'"),
@@ -295,6 +299,12 @@ def test_a_suite_that_does_not_exist_is_refused_with_a_suggestion(tmp_path):
     (tmp_path / "bad.toml").write_text("envs = [")
     with pytest.raises(ValueError, match="is not valid TOML"):
         load_suite(tmp_path / "bad.toml")
+    (tmp_path / "latin.toml").write_bytes('name = "h\xfctte"'.encode("latin-1"))
+    with pytest.raises(ValueError, match=r"latin\.toml' is not valid TOML"):
+        load_suite(tmp_path / "latin.toml")
+    (tmp_path / "odd.toml").write_text('envs = [3]\npolicies = ["hover"]')
+    with pytest.raises(ValueError, match=r"odd\.toml': .*got 3"):
+        load_suite(tmp_path / "odd.toml")
 
 
 @pytest.mark.parametrize(

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
+import gymnasium
 import pytest
 
 from baselines.__main__ import COMMANDS, main
-from baselines.options import read_assignments
+from baselines.commands import _resume
+from baselines.options import BenchmarkOptions, read_assignments
 from baselines.policy import TRACKING_POLICIES
 from quad_envs.registration import TRACKING
 
@@ -117,10 +121,43 @@ def test_evaluate_discards_another_run_if_asked_to(capsys, tmp_path):
         (["benchmark", "quik"], "unknown suite 'quik'; did you mean 'quick'"),
         (["benchmark", "quick", "--engine", "processe"], "did you mean 'processes'"),
         (["list", "hovr"], "did you mean 'hover'"),
+        (["evaluate", HELIX, "hover", "--set", "reference=nofile.csv"], "nofile.csv"),
+        (["evaluate", HELIX, "hover", "--seed", "-1"], "seed must be a whole number >= 0, got -1"),
+        (["evaluate", "CartPole-v1", "hover"], "one of the ids quad/Regulation-v0"),
+        (["evaluate", HELIX, "hover", "--save-episodes"], "--save-episodes needs a folder"),
+        (["evaluate", HELIX, "hover", "--fresh"], "--fresh needs a folder"),
     ],
 )
 def test_bad_input_gets_one_clear_line_and_exit_code_2(capsys, arguments, message):
     assert message in fails(capsys, *arguments)
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (PermissionError(13, "Permission denied", "a.csv"), "a.csv: Permission denied"),
+        (gymnasium.error.NameNotFound("first\nsecond"), "error: first second"),
+        (MemoryError(), "not enough memory"),
+        (OverflowError("int too large"), "a number is too large: int too large"),
+    ],
+)
+def test_what_bad_input_raises_elsewhere_gets_one_clear_line_too(capsys, monkeypatch, error, message):
+    def fail(options):
+        raise error
+
+    monkeypatch.setitem(COMMANDS, "list", COMMANDS["list"]._replace(run=fail))
+    assert message in fails(capsys, "list")
+
+
+def test_a_mistake_of_ours_keeps_its_traceback(monkeypatch):
+    monkeypatch.setitem(COMMANDS, "list", COMMANDS["list"]._replace(run=lambda options: {}["missing"]))
+    with pytest.raises(KeyError):
+        main(["list"])
+
+
+def test_the_advice_to_resume_can_be_pasted_into_a_shell():
+    text = _resume(BenchmarkOptions(suite="my suite.toml"), Path("a folder"))
+    assert shlex.split(text) == ["quad-envs", "benchmark", "my suite.toml", "--out", "a folder"]
 
 
 def test_a_folder_that_cannot_be_written_gets_one_clear_line(capsys, tmp_path):

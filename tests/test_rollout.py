@@ -147,6 +147,21 @@ def test_the_number_of_episodes_must_be_a_whole_positive_one(episodes):
         run_episodes(make_policy("hover", env), env, episodes)
 
 
+@pytest.mark.parametrize("seed", [-1, 0.5, True])
+def test_the_seed_must_be_a_whole_number_that_is_not_negative(seed):
+    env = gymnasium.make(HELIX)
+    with pytest.raises(ValueError, match="seed must be a whole number >= 0"):
+        run_episodes(make_policy("hover", env), env, 1, seed)
+
+
+def test_environments_that_cannot_be_measured_are_refused_with_a_remedy():
+    policy = make_policy("hover", HELIX)
+    with pytest.raises(ValueError, match=r"cannot find the task of .*CartPole"):
+        evaluate(policy, "CartPole-v1")
+    with pytest.raises(ValueError, match=r'SyncVectorEnv hides .*vectorization_mode="vector_entry_point"'):
+        evaluate(policy, gymnasium.make_vec(HELIX, num_envs=2, vectorization_mode="sync"))
+
+
 def test_policies_fly_from_the_same_starts():
     env = gymnasium.make("quad/RandomTracking-v0", disturbance="gusts")
     flights = [list(run_episodes(make_policy(name, env), env, 3, seed=7)) for name in ("hover", "random")]
