@@ -6,6 +6,7 @@ Episode i starts with the environment seed `seed + i`, whatever the policy: poli
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import islice
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -30,7 +31,7 @@ _WARM_UP_CALLS = 2  # the first compiles, the second takes the path with a state
 class Episode(NamedTuple):
     """One flight of T control periods. Row k of what is per step belongs to the step from k to k + 1."""
 
-    task: Task
+    task: Task  # as flown: with the time limit that Gymnasium set, where that one is shorter
     seed: int
     states: Array  # (T+1, 16), true plant [p, V_B, Theta, Omega, F]
     references: Array  # (T+1, 8), p_ref, v_ref, sin psi_ref, cos psi_ref
@@ -144,10 +145,10 @@ def run_episodes(policy: Policy, env: Any, episodes: int, seed: int = 0) -> Iter
 
 
 def _single_episodes(policy: Policy, env: Any, episodes: int, seed: int) -> Iterator[Episode]:
-    plain = env.unwrapped
+    plain, task = env.unwrapped, _flown_task(env)
     for i in range(episodes):
         observation, _ = env.reset(seed=seed + i)
-        recorder = _Recorder(plain.task, [seed + i], plain.reference[None])
+        recorder = _Recorder(task, [seed + i], plain.reference[None])
         recorder.plants.append(plain.state[None])
         if i == 0:
             _warm_up(policy, observation[None])
@@ -162,6 +163,13 @@ def _single_episodes(policy: Policy, env: Any, episodes: int, seed: int) -> Iter
             recorder.add(state, actions, told, seconds, plain.state[None])
             start = np.zeros(1, dtype=np.bool_)
         yield from recorder.episodes()
+
+
+def _flown_task(env: Any) -> Task:
+    """The Task with the time limit of `gymnasium.make(..., max_episode_steps=n)`, as `make_vec` has it."""
+    task: Task = env.unwrapped.task
+    limit = getattr(getattr(env, "spec", None), "max_episode_steps", None) or 0
+    return replace(task, episode_steps=limit) if 0 < limit < task.episode_steps else task
 
 
 def _vector_episodes(policy: Policy, env: Any, episodes: int, seed: int) -> Iterator[Episode]:

@@ -112,6 +112,19 @@ def test_a_vector_environment_flies_full_episodes_too():
     assert all(np.isnan(episode.decision_times).all() for episode in episodes)
 
 
+def test_a_shorter_time_limit_counts_the_same_in_single_and_vector_environments():
+    envs = gymnasium.make(HELIX, max_episode_steps=50), gymnasium.make_vec(HELIX, 2, max_episode_steps=50)
+    policy = make_policy("hover", HELIX)
+    one, other = (measure(next(run_episodes(policy, env, 1))) for env in envs)
+    assert one.steps == 50 and one.score == other.score > 0.0
+    assert one.steady_rms == other.steady_rms > 0.0
+
+
+def test_a_longer_time_limit_changes_nothing():
+    env = gymnasium.make(HELIX, max_episode_steps=500)
+    assert next(run_episodes(make_policy("hover", env), env, 1)).task == env.unwrapped.task
+
+
 def test_a_vector_environment_that_resets_in_the_same_step_is_refused():
     vector = gymnasium.make_vec(HELIX, num_envs=2, autoreset_mode=AutoresetMode.SAME_STEP)
     with pytest.raises(ValueError, match="SAME_STEP"):
