@@ -93,7 +93,7 @@ class Evaluation:
         rows = []
         for name, value in self.summary().items():
             found = (getattr(record, name) for record in self.records)
-            column = [entry for entry in found if math.isfinite(entry)]
+            column = [entry for entry in found if math.isfinite(entry) and value.n]
             spread = [min(column), max(column)] if column else [math.nan, math.nan]
             cells = [value.mean, value.half_width, *spread]
             rows.append([name, _UNITS[name], *map(format_number, cells), str(value.n)])

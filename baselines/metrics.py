@@ -2,7 +2,8 @@
 
 The columns stand side by side and are never merged into one. RMS and effort are the dissertation's "average
 RMS" and input effort: means over the samples k = 0..T-1 that were flown. What a crash cuts short, so that it
-would look cheap, is nan.
+would look cheap, is nan, and so are the mean and the paired difference of these columns (CUT_SHORT) as soon
+as one flight crashed: the mean over the survivors would favour a policy that crashes on the hard starts.
 """
 
 from __future__ import annotations
@@ -65,6 +66,8 @@ AVERAGED = (
     "violation_share",
     "saturation_share",
 )
+# Columns that are nan after a crash, and therefore not averaged over what is left.
+CUT_SHORT = ("cost", "position_rms", "steady_rms", "settling_time")
 COUNTED = ("crashed", "relaxed", "previous_plan", "clipped_sdre", "hover")
 
 
@@ -147,13 +150,16 @@ class Estimate(NamedTuple):
     n: int  # values behind it; those that are nan are left out
 
 
+_NO_ESTIMATE = Estimate(float("nan"), float("nan"), 0)
+
+
 def estimate(values: Iterable[float]) -> Estimate:
     """Mean and 95 % interval over flights."""
     from scipy.special import stdtrit
 
     x = np.array([value for value in values if np.isfinite(value)], dtype=np.float64)
     if x.size == 0:
-        return Estimate(float("nan"), float("nan"), 0)
+        return _NO_ESTIMATE
     if x.size == 1:
         return Estimate(float(x[0]), float("nan"), 1)
     t = float(stdtrit(x.size - 1, 0.975))
@@ -163,7 +169,8 @@ def estimate(values: Iterable[float]) -> Estimate:
 def paired_difference(ours: Sequence[Record], theirs: Sequence[Record], column: str) -> Estimate:
     """Mean of ours - theirs over flights from the same start.
 
-    The spread between starts is far larger than that between policies on one start.
+    The spread between starts is far larger than that between policies on one start. A column of CUT_SHORT has
+    no difference, nan, where one of the paired flights crashed.
 
     Args:
         ours: Records of one policy.
@@ -175,16 +182,24 @@ def paired_difference(ours: Sequence[Record], theirs: Sequence[Record], column: 
     """
     if column not in AVERAGED:
         raise ValueError(f"column must be one of {', '.join(AVERAGED)}, got {column!r}")
-    other = {(record.seed, record.agent): getattr(record, column) for record in theirs}
+    other = {(record.seed, record.agent): record for record in theirs}
     pairs = [(record, other[key]) for record in ours if (key := (record.seed, record.agent)) in other]
     if not pairs:
         raise ValueError("paired_difference needs flights with the same seeds, and these have none in common")
-    return estimate(getattr(record, column) - value for record, value in pairs)
+    if column in CUT_SHORT and any(one.crashed or two.crashed for one, two in pairs):
+        return _NO_ESTIMATE
+    return estimate(getattr(one, column) - getattr(two, column) for one, two in pairs)
 
 
 def summarize(records: Sequence[Record]) -> dict[str, Estimate]:
-    """Column -> estimate, for every averaged column."""
-    return {name: estimate(getattr(record, name) for record in records) for name in AVERAGED}
+    """Column -> estimate, for every averaged column; nan for those of CUT_SHORT if a flight crashed."""
+    crashed = any(record.crashed for record in records)
+    return {
+        name: _NO_ESTIMATE
+        if crashed and name in CUT_SHORT
+        else estimate(getattr(record, name) for record in records)
+        for name in AVERAGED
+    }
 
 
 def totals(records: Sequence[Record]) -> dict[str, int]:

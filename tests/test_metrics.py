@@ -10,7 +10,8 @@ import pytest
 
 import quad_envs  # noqa: F401  registers the ids
 from baselines import estimate, make_policy, measure, paired_difference, run_episodes
-from baselines.metrics import AVERAGED, decision_quantiles, summarize, totals, worst_violations
+from baselines.evaluation import Evaluation
+from baselines.metrics import AVERAGED, CUT_SHORT, decision_quantiles, summarize, totals, worst_violations
 from baselines.rollout import Episode
 from quad_envs import Limits, Task
 from quad_envs.constraints import constraint_names
@@ -179,3 +180,21 @@ def test_the_summary_has_every_averaged_column():
     records = [measure(flight(seed=i)) for i in range(3)]
     assert tuple(summarize(records)) == AVERAGED
     assert worst_violations(records) == {}
+
+
+def test_a_policy_that_crashes_on_the_hard_start_has_no_mean_cost():
+    easy, hard = measure(flight(seed=0)), measure(flight(seed=1))._replace(cost=100.0)
+    lost = measure(flight(seed=1, crashed=True, terminated=True))
+    for column in CUT_SHORT:
+        assert math.isnan(summarize([easy, lost])[column].mean)
+        assert math.isnan(paired_difference([easy, lost], [easy, hard], column).mean)
+        assert math.isnan(paired_difference([easy, hard], [easy, lost], column).mean)
+    assert summarize([easy, hard])["cost"].mean == 50.0
+    assert summarize([easy, lost])["score"].n == paired_difference([easy, lost], [easy, hard], "score").n == 2
+
+
+def test_a_table_shows_no_cost_where_a_flight_crashed():
+    easy, lost = measure(flight(seed=0)), measure(flight(seed=1, crashed=True, terminated=True))
+    text = str(Evaluation("env", "policy", 0, (easy._replace(cost=7.0), lost), (math.nan,) * 3))
+    cost = next(line for line in text.splitlines() if line.startswith("cost"))
+    assert cost.split() == ["cost", "-", "-", "-", "-", "-", "0"]
