@@ -88,11 +88,12 @@ def _cache() -> Finding:
     """Whether compiled kernels can be kept."""
     from quad_envs.reward import stage_cost_kernel  # any kernel
 
-    stats = getattr(stage_cost_kernel, "stats", None)
-    path = Path(str(stats.cache_path)) if stats is not None else None
-    if path is None:
+    outer = getattr(stage_cost_kernel, "_outer", None)  # the one that Python calls, and that is cached
+    if outer is None:
         return Finding("cache", False, "kernels are not compiled: is NUMBA_DISABLE_JIT set?")
-    place = path
+    if outer.stats.cache_path is None:
+        return Finding("cache", False, "kernels are not kept, every process compiles anew")
+    place = path = Path(outer.stats.cache_path)
     while not place.exists():
         place = place.parent
     ok = os.access(place, os.W_OK)

@@ -236,6 +236,7 @@ def test_doctor_examines_the_installation(capsys):
     findings = {finding["check"]: finding for finding in json.loads(capsys.readouterr().out)}
     assert set(findings) == {"versions", "packages", "cache", "self-test", "extras"}
     assert all(finding["ok"] for finding in findings.values())
+    assert Path(findings["cache"]["detail"]).is_absolute()
 
 
 def test_doctor_names_a_package_of_the_same_name(monkeypatch):
