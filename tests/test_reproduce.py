@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from baselines.reproduce import SECTIONS, reproduce, run
+from baselines.reproduce import SECTIONS, reproduce, run, tables
 from baselines.reproduce.published import TABLE_4_1, TABLE_4_2
 from baselines.reproduce.regulation_claims import comparable_claim, instability_claim, saturation_claim
 from baselines.reproduce.results import Cell, Claim, Section, verdict
@@ -46,6 +46,35 @@ def test_a_verdict_follows_from_the_share_of_cases(share, word):
 def test_an_unknown_section_is_refused_with_a_suggestion():
     with pytest.raises(ValueError, match=r"did you mean 'table-4\.1'"):
         reproduce(["table4.1"])
+
+
+@pytest.mark.parametrize("jobs", [0, -1, True])
+def test_the_number_of_jobs_must_be_a_whole_positive_one(jobs):
+    with pytest.raises(ValueError, match="jobs must be a whole number >= 1"):
+        reproduce(["table-4.1"], jobs)
+
+
+def test_a_name_that_is_unknown_leaves_no_folder(tmp_path):
+    with pytest.raises(ValueError, match="unknown table"):
+        run(["table4.1"], tmp_path / "out", False, 1)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_tables_and_claims_share_their_flights_however_many_jobs_fly_them(monkeypatch):
+    flown = []
+
+    def count(flights, jobs):
+        flown.extend((flight.controller, flight.horizon, flight.reference) for flight in flights)
+        return [len(flown)] * len(flights)
+
+    monkeypatch.setattr(tables, "_FLOWN", {})
+    monkeypatch.setattr(tables, "fly_all", count)
+    first = tables.table_flights(("LMPC", "SDC 1/2"), jobs=1)
+    assert tables.table_flights(("LMPC", "SDC 1/2"), jobs=2) == first and len(flown) == 30
+    assert tables.table_flights(("LMPC", "SDC 1/2", "SDC 1"), jobs=2).items() >= first.items()
+    assert len(flown) == 45
+    tables.table_flights(("LMPC",), climbing=True)
+    assert len(flown) == 60
 
 
 def test_taylor_form_is_better_than_claimed_inside_and_useless_far_outside():

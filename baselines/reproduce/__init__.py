@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from ..errors import unknown_name
+from ..results import write_atomic
 from .regulation_claims import REGULATION_CLAIMS
 from .results import Section
 from .tables import table_4_1, table_4_2
@@ -28,42 +28,43 @@ SECTIONS: dict[str, Callable[[int], Section]] = {
 }
 
 
-def reproduce(what: Sequence[str] = (), jobs: int = 1) -> list[Section]:
-    """Reproduce tables and claims.
+def sections(what: Sequence[str] = (), jobs: int = 1) -> Iterator[Section]:
+    """The sections that are asked for, each as soon as it is flown.
 
     Args:
         what: Names in SECTIONS; none, or "all", for all of them.
-        jobs: Flights in parallel. Decision times are measured one flight at a time whatever it is.
+        jobs: Flights in parallel, >= 1. Decision times are measured one flight at a time whatever it is.
 
     Raises:
-        ValueError: If a name is unknown.
+        ValueError: If a name is unknown or jobs < 1; at once, before the first section.
     """
     for name in what:
         if name != "all" and name not in SECTIONS:
             raise ValueError(unknown_name("table or claims", name, [*SECTIONS, "all"]))
+    if isinstance(jobs, bool) or not isinstance(jobs, int) or jobs < 1:
+        raise ValueError(f"jobs must be a whole number >= 1, got {jobs!r}")
     names = list(SECTIONS) if not what or "all" in what else list(dict.fromkeys(what))
-    return [SECTIONS[name](jobs) for name in names]
+    return (SECTIONS[name](jobs) for name in names)
+
+
+def reproduce(what: Sequence[str] = (), jobs: int = 1) -> list[Section]:
+    """Reproduce tables and claims; see `sections`."""
+    return list(sections(what, jobs))
 
 
 def run(what: list[str], out: Path | None, as_json: bool, jobs: int) -> int:
     """The command: print the sections, and write them to `out`/reproduce.json where given."""
-    for name in what:
-        if name != "all" and name not in SECTIONS:
-            raise ValueError(unknown_name("table or claims", name, [*SECTIONS, "all"]))
+    asked = sections(what, jobs)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-    names = list(SECTIONS) if not what or "all" in what else list(dict.fromkeys(what))
-    sections = []
-    for name in names:
-        section = SECTIONS[name](jobs)
-        sections.append(section)
+    found = []
+    for section in asked:
+        found.append(section)
         if not as_json:
             print(section, end="\n\n", flush=True)
-    text = json.dumps({"sections": [section.to_dict() for section in sections]}, indent=2)
+    text = json.dumps({"sections": [section.to_dict() for section in found]}, indent=2) + "\n"
     if as_json:
-        sys.stdout.write(text + "\n")
+        sys.stdout.write(text)
     if out is not None:
-        partial = out / ".reproduce.json.partial"
-        partial.write_text(text + "\n", encoding="utf-8")
-        os.replace(partial, out / "reproduce.json")
+        write_atomic(out / "reproduce.json", text.encode())
     return 0

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 from joblib import Parallel, delayed
 
@@ -20,9 +18,8 @@ _DT = 0.05  # s
 _STARTS = ((2.0, 2.0, 2.0), (2.0, 2.0, -2.0), (4.0, 4.0, 4.0), (4.0, 4.0, -4.0), (8.0, 0.0, 0.0))
 
 
-@cache
 def _all_cells(climbing: bool, jobs: int) -> dict[tuple[str, int, str], Outcome]:
-    return table_flights(("LMPC", *_NONLINEAR), CLIMBING if climbing else DESCENDING, jobs)
+    return table_flights(("LMPC", *_NONLINEAR), climbing, jobs)
 
 
 def _wins(quantity: str, climbing: bool, jobs: int) -> dict[str, int]:
