@@ -2,16 +2,17 @@
 
 A kernel may be called from other kernels and from Python. Numba by itself emits machine code, wrappers
 for Python and a cache file for every kernel at every level of nesting, which doubles the time of the first
-decision of an MPC. Here a kernel that is called from another one hands over optimised LLVM code and no more;
-only the kernel that Python calls becomes machine code and is cached on disk. The cache is void as soon as any
-source file of the suite changes, since numba itself would not notice a change in a kernel of another file.
+decision of an MPC. Here a kernel that is called from another one hands over plain LLVM code and no more; only
+the kernel that Python calls is optimised, as a whole, becomes machine code and is cached on disk. The cache
+is void as soon as any source file of the suite changes, since numba itself would not notice a change in a
+kernel of another file.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -31,20 +32,29 @@ _PACKAGES = ("quad_envs", "controllers", "baselines")
 
 @register_pass(mutates_CFG=True, analysis_only=False)
 class _InnerLowering(NativeLowering):
-    """Lower to LLVM code and stop there: it becomes machine code as a part of its caller."""
+    """Lower to LLVM code and stop there: it is optimised and becomes machine code as a part of its caller."""
 
     _name = "inner_lowering"
 
     def run_pass(self, state: Any) -> bool:
-        """Lower without machine code."""
+        """Lower without optimisation or machine code."""
         context = state.targetctx
-        state.library = context.codegen().create_library(state.func_id.func_qualname)
+        library = context.codegen().create_library(state.func_id.func_qualname)
+        library._finalize_final_module = partial(_hand_over, library)
+        library._optimize_final_module = lambda: None
+        state.library = library
         # Numba wants a callable of its own to register the kernel under. This one is never called.
         context.get_executable = lambda library, descriptor, env: {}.popitem
         try:
             return bool(super().run_pass(state))  # type: ignore[no-untyped-call]
         finally:
             del context.get_executable
+
+
+def _hand_over(library: Any) -> None:
+    """End the library's construction without machine code."""
+    library._finalize_dynamic_globals()
+    library._finalized = True
 
 
 class _InnerCompiler(CompilerBase):
