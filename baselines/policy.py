@@ -120,6 +120,7 @@ def make_policy(name: str, env: Any, **options: Any) -> Policy:
         env: An environment (wrapped or not), a vector environment, an id, or a Task. Only its Task is used.
         options: Of the policy, see `policy_options`; MPCs take `horizon`, `solver` and what their chapter
             offers. A horizon that is not given is 25, or the preview of the task where that is shorter.
+            Feedback linearization uses the acceleration of the reference where there is a preview.
 
     Raises:
         ValueError: If the name, an option or its value is not allowed, or the horizon exceeds the preview.
@@ -136,13 +137,16 @@ def make_policy(name: str, env: Any, **options: Any) -> Policy:
     preview = task.layout.preview
     if "horizon" in defaults:
         options.setdefault("horizon", min(defaults["horizon"], preview))
+    if "acceleration_feed_forward" in defaults:
+        options.setdefault("acceleration_feed_forward", defaults["acceleration_feed_forward"] and preview > 0)
     try:
         controller = factory(task, **options)
     except TypeError as error:
         raise ValueError(f"policy {name!r} refused its options {options}: {error}") from error
     if controller.horizon > preview:
+        remedy = f"horizon <= {preview}" if "horizon" in defaults else "acceleration_feed_forward=False"
         raise ValueError(
             f"policy {name!r} looks {controller.horizon} steps ahead, the observation {preview}: "
-            f"choose horizon <= {preview}, or gym.make({task.env_id!r}, preview={controller.horizon})"
+            f"choose {remedy}, or gym.make({task.env_id!r}, preview={controller.horizon})"
         )
     return ControllerPolicy(controller, task, name)

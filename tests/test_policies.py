@@ -308,6 +308,14 @@ def test_a_policy_that_breaks_the_protocol_is_told_where(broken, message):
         check_policy(broken(), HELIX)
 
 
+def test_feedback_linearization_does_without_a_preview():
+    env = gymnasium.make(HELIX, preview=0)
+    check_policy(make_policy("feedback-linearization", env), env)
+    with pytest.raises(ValueError, match="choose acceleration_feed_forward=False, or gym"):
+        make_policy("feedback-linearization", env, acceleration_feed_forward=True)
+    assert make_policy("feedback-linearization", gymnasium.make(HELIX)).controller.horizon == 1
+
+
 def test_hover_needs_no_preview():
     env = gymnasium.make(HELIX, preview=0)
     check_policy(ControllerPolicy(Hover(env.unwrapped.task), env.unwrapped.task, "hover"), env)
