@@ -91,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     parser = make_parser()
     if given and not given[0].startswith("-") and given[0] not in COMMANDS:
-        from .errors import unknown_name
+        from quad_envs.names import unknown_name
 
         parser.error(unknown_name("command", given[0], COMMANDS))
     found, rest = parser.parse_known_args(given)

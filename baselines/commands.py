@@ -12,7 +12,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from .errors import unknown_name
+from quad_envs.names import unknown_name
+
 from .options import BenchmarkOptions, EvaluateOptions, ListOptions, read_assignments
 
 

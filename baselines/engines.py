@@ -8,7 +8,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, TypeVar
 
-from .errors import unknown_name
+from quad_envs.names import unknown_name
 
 ENGINES = ("processes", "ray", "dask")
 _NEEDS = {

@@ -8,10 +8,9 @@ import gymnasium
 import numpy as np
 
 import quad_envs  # noqa: F401  registers the ids
+from quad_envs.names import unknown_name
 from quad_envs.registration import TRACKING
 from quad_envs.tasks import Task
-
-from .errors import unknown_name
 
 
 def make_env(env_id: str, **kwargs: Any) -> gymnasium.Env[Any, Any]:

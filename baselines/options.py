@@ -10,8 +10,6 @@ from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar, get_args, get_type_hints
 
-from .errors import unknown_name
-
 Options = TypeVar("Options")
 
 
@@ -126,6 +124,8 @@ def refuse_unknown(rest: Sequence[str], kind: type[Any], parser: Parser) -> None
     """One clear line about arguments that no option takes."""
     if not rest:
         return
+    from quad_envs.names import unknown_name  # here, so that --help need not load Gymnasium
+
     hints = get_type_hints(kind, include_extras=True)
     known = [_flag(name) for name, hint in hints.items() if not isinstance(get_args(hint)[1], Positional)]
     name = rest[0].split("=")[0]

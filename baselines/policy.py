@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import unknown_name
+from quad_envs.names import unknown_name
 
 Actions = NDArray[np.float32]
 Counts = NDArray[np.int64]

@@ -21,9 +21,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+from quad_envs.names import unknown_name
 from quad_envs.registration import TRACKING
 
-from .errors import unknown_name
 from .policy import TRACKING_POLICIES
 
 if sys.version_info >= (3, 11):

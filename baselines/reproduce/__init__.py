@@ -7,7 +7,8 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from ..errors import unknown_name
+from quad_envs.names import unknown_name
+
 from ..results import write_atomic
 from .regulation_claims import REGULATION_CLAIMS
 from .results import Section
