@@ -88,7 +88,7 @@ def _cache() -> Finding:
     """Whether compiled kernels can be kept."""
     from quad_envs.reward import stage_cost_kernel  # any kernel
 
-    outer = getattr(stage_cost_kernel, "_outer", None)  # the one that Python calls, and that is cached
+    outer = getattr(stage_cost_kernel, "entry", None)  # the one that Python calls, and that is cached
     if outer is None:
         return Finding("cache", False, "kernels are not compiled: is NUMBA_DISABLE_JIT set?")
     if outer.stats.cache_path is None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .._numba import entry_of
 from ..disturbances import Disturbance, make_disturbance
 from ..observations import N_REFERENCE
 from ..parameters import N_STATE, POSITION, Array
@@ -27,6 +28,8 @@ from .kernel import (
     task_vector,
 )
 from .options import CRASH_TILT, TrackingOptions
+
+_step = entry_of(step_rows)
 
 
 class TrackingBatch:
@@ -68,7 +71,9 @@ class TrackingBatch:
             if random[table]:
                 self._which[table] = np.arange(n)
         self._scratch = np.zeros(SCRATCH_SIZE)
-        self._steps = np.zeros(n, dtype=np.int64)
+        # What the step kernel takes before the actions and between them and the observations.
+        self._before = (self.rows, self.references, self.disturbances, self.noises, self._which)
+        self._after = (self._vector, self._scratch, np.zeros(n, dtype=np.int64))
 
     def reset_row(
         self,
@@ -132,24 +137,13 @@ class TrackingBatch:
         """Move all flights by one control period and write their observations.
 
         Args:
-            actions: (n, 4), entries in [-1, 1]; others are clipped and counted.
-            out: (n, layout.size) float32.
+            actions: (n, 4) or, for one flight, (4,), contiguous; clipped to [-1, 1], which is counted.
+            out: (n, layout.size) or (layout.size,), float32.
 
         Raises:
             ValueError: If an action is not finite; then no flight has moved.
         """
-        bad = step_rows(
-            self.rows,
-            self.references,
-            self.disturbances,
-            self.noises,
-            self._which,
-            actions,
-            self._vector,
-            self._scratch,
-            self._steps,
-            out,
-        )
+        bad = _step(*self._before, actions.reshape(-1), *self._after, out.reshape(-1))
         if bad >= 0:
             where = f"[{bad}]" if self.n == 1 else f"[{bad // 4}, {bad % 4}]"
             raise ValueError(

@@ -190,11 +190,11 @@ def step_rows(
     disturbances: Array,
     noises: Array,
     which: NDArray[np.int64],
-    actions: NDArray[np.floating],
+    flat_actions: NDArray[np.floating],
     task: Array,
     scratch: Array,
     steps: NDArray[np.int64],
-    out: NDArray[np.float32],
+    flat_out: NDArray[np.float32],
 ) -> int:
     """One control period of every row.
 
@@ -204,16 +204,18 @@ def step_rows(
         disturbances: Tables (n_tables, n_steps, 2 substeps + 1, 6); no steps for none.
         noises: Tables (n_tables, n_steps, 12); no steps for none.
         which: Reference, disturbance and noise table of each row, (3, n) int64.
-        actions: (n, 4).
+        flat_actions: (4 n,).
         task: Task vector.
         scratch: (SCRATCH_SIZE,).
         steps: Scratch, (n,) int64.
-        out: Observations, (n, layout.size) float32.
+        flat_out: Observations, (n layout.size,) float32.
 
     Returns:
         -1, or the flat index of the first non-finite action; then nothing was changed.
     """
     n = rows.shape[0]
+    actions = flat_actions.reshape(n, 4)
+    out = flat_out.reshape(n, flat_out.size // n)
     for i in range(n):
         for a in range(4):
             if not np.isfinite(actions[i, a]):

@@ -132,11 +132,11 @@ class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Hold the rotor commands over one control period."""
         if self._np_random is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        actions = np.asarray(action, dtype=np.float32)
+        actions = np.ascontiguousarray(action, dtype=np.float32)
         if actions.shape != (4,):
             raise ValueError(f"action must have shape (4,), one entry per rotor, got {actions.shape}")
         observation = np.empty(self._size, dtype=np.float32)
-        self._batch.step(actions.reshape(1, 4), observation.reshape(1, -1))
+        self._batch.step(actions, observation)
         scores = self._scores.tolist()
         return (
             observation,
