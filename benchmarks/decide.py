@@ -1,10 +1,10 @@
 """Decision times in closed loop: `python -m benchmarks.decide [--horizons 5 10 25 45] [--quick] [--json]`.
 
 Every controller decides through `predict` in two flights: "nominal" (a climbing helix, no constraint active)
-and "tight" (set-point jumps with 2.45 N rotors and 5 N/s, many active). All fly in turns in one run. The time
-of a decision is the smallest over the repetitions of its flight, which repeat exactly; p50, p99 and max are
-over the decisions. The closed-loop cost is the summed stage cost. DAQP and CasADi-IPOPT fly along when they
-are installed.
+and "tight" (set-point jumps with 2.45 N rotors and 5 N/s, many active). All fly in turns, flight by flight,
+in one run. The time of a decision is the smallest over the repetitions of its flight, which repeat exactly;
+p50, p99 and max are over the decisions. The closed-loop cost is the summed stage cost. DAQP and CasADi-IPOPT
+fly along when they are installed.
 """
 
 from __future__ import annotations
@@ -107,36 +107,35 @@ class Result(NamedTuple):
     fallbacks: int
 
 
+def fly(env: Any, policy: Any) -> tuple[list[float], float, int]:
+    """One flight: seconds of each decision, summed stage cost, fallbacks."""
+    observation, _ = env.reset(seed=0)
+    state, start, seconds, cost = None, np.ones(1, dtype=np.bool_), [], 0.0
+    for _ in range(env.unwrapped.task.episode_steps):
+        begin = perf_counter()
+        action, state = policy.predict(observation[None], state, start)
+        seconds.append(perf_counter() - begin)
+        observation, _, _, _, info = env.step(action[0])
+        cost += info["stage_cost"]
+        start = np.zeros(1, dtype=np.bool_)
+    return seconds, cost, int(getattr(state, "fallbacks", np.zeros((1, 5)))[0, 1:].sum())
+
+
 def fly_in_turns(scene: str, horizon: int, repetitions: int) -> dict[str, Result]:
-    """Fly all controllers, interleaved step by step."""
+    """Fly all controllers one after the other, and all of them again and again."""
     found = entries(horizon)
-    env_of = {
-        e.name: gym.make("quad/Regulation-v0", start_box=0.0, preview=max(25, horizon), **SCENES[scene])
-        for e in found
-    }
-    policy_of = {e.name: e.make(env_of[e.name], horizon) for e in found}
-    times: dict[str, list[list[float]]] = {e.name: [] for e in found}
-    cost, fallbacks = dict.fromkeys(times, 0.0), dict.fromkeys(times, 0)
+    env = gym.make("quad/Regulation-v0", start_box=0.0, preview=max(25, horizon), **SCENES[scene])
+    policies = {entry.name: entry.make(env, horizon) for entry in found}
+    times: dict[str, list[list[float]]] = {entry.name: [] for entry in found}
+    outcome: dict[str, tuple[float, int]] = {}
     for repetition in range(repetitions + 1):  # the first compiles
-        flying = [e for e in found if not (e.slow and repetition > 1)]
-        seen = {e.name: env_of[e.name].reset(seed=0)[0] for e in flying}
-        state: dict[str, Any] = dict.fromkeys(seen)
-        for name in seen:
-            cost[name] = 0.0
-            times[name].append([])
-        start = np.ones(1, dtype=np.bool_)
-        for _ in range(env_of[found[0].name].unwrapped.task.episode_steps):
-            for name in seen:
-                begin = perf_counter()
-                action, state[name] = policy_of[name].predict(seen[name][None], state[name], start)
-                times[name][-1].append(perf_counter() - begin)
-                seen[name], _, _, _, info = env_of[name].step(action[0])
-                cost[name] += info["stage_cost"]
-            start = np.zeros(1, dtype=np.bool_)
-        for name in seen:
-            fallbacks[name] = int(getattr(state[name], "fallbacks", np.zeros((1, 5)))[0, 1:].sum())
+        for entry in found:
+            if not (entry.slow and repetition > 1):
+                seconds, *rest = fly(env, policies[entry.name])
+                times[entry.name].append(seconds)
+                outcome[entry.name] = rest[0], rest[1]
     return {
-        name: Result(*quantiles(list(np.min(rows[1:], axis=0))), cost[name], fallbacks[name])
+        name: Result(*quantiles(list(np.min(rows[1:], axis=0))), *outcome[name])
         for name, rows in times.items()
     }
 

@@ -127,7 +127,7 @@ class _Announcer(event.Listener):
         module = event.data["dispatcher"].py_func.__module__ or ""
         if not self.said and module.split(".")[0] in _PACKAGES:
             self.said = True
-            message = "quad_envs: compiling kernels, once per installation (a few seconds) ..."
+            message = "quad_envs: compiling kernels, once per installation (up to half a minute) ..."
             print(message, file=sys.stderr, flush=True)
 
     def on_end(self, event: Any) -> None:
