@@ -80,6 +80,11 @@ def entries(horizon: int) -> list[Entry]:
 
         return IpoptPolicy(env.unwrapped.task, N)
 
+    def do_mpc(env: Any, N: int) -> Any:
+        from .peers import DoMpcPolicy
+
+        return DoMpcPolicy(env.unwrapped.task, N)
+
     exact = {"velocity_error": "body", "frame": "hover"}
     found = [
         Entry("lmpc", ours("lmpc")),
@@ -92,8 +97,10 @@ def entries(horizon: int) -> list[Entry]:
     ]
     if importlib.util.find_spec("daqp"):
         found.append(Entry("sdc-nmpc, DAQP condensed", daqp))
-    if importlib.util.find_spec("casadi") and horizon == 25:
+    if importlib.util.find_spec("casadi"):
         found.append(Entry("nmpc, CasADi IPOPT", ipopt, slow=True))
+    if importlib.util.find_spec("do_mpc"):
+        found.append(Entry("nmpc, do-mpc (no rate limit)", do_mpc, slow=True))
     return found
 
 

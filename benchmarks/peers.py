@@ -62,9 +62,7 @@ class IpoptPolicy:
         N = self.horizon
         view = self.task.layout.decode(observation[0])
         x_0 = np.concatenate([np.zeros(3), view.V_B, view.Theta, view.Omega])
-        r = np.zeros((N + 1, N_STATE))
-        r[:, :6] = view.preview[: N + 1, :6]
-        r[:, 8] = np.arctan2(view.preview[: N + 1, 6], view.preview[: N + 1, 7])
+        r = _references(view, N)
         if state is None or (episode_start is not None and np.any(episode_start)):
             guess = np.concatenate([np.tile(x_0, N + 1), np.zeros(N_INPUT * N)])
         else:
@@ -119,8 +117,8 @@ def _build(task: Task, N: int) -> tuple[Any, dict[str, Array]]:
     return ca.nlpsol("solver", "ipopt", problem, options), bounds
 
 
-def _rk4(ca: Any, task: Task) -> Any:
-    """x_{k+1} = phi(x_k, F_k) in CasADi, written from Eq. (2.32) and not from our kernels."""
+def _derivative(ca: Any, task: Task) -> Any:
+    """f(x, F) in CasADi, written from Eq. (2.32) and not from our kernels."""
     params = task.params
     Jx, Jy, Jz = params.inertia
     x, F = ca.SX.sym("x", N_STATE), ca.SX.sym("F", N_INPUT)
@@ -140,10 +138,79 @@ def _rk4(ca: Any, task: Task) -> Any:
         (Jx - Jy) / Jz * Omega[0] * Omega[1],
     )
     drift = ca.vertcat(R.T @ V, ca.cross(V, Omega) + R @ ca.DM([0, 0, params.gravity]), W @ Omega, gyro)
-    f = ca.Function("f", [x, F], [drift + ca.DM(params.input_matrix()) @ F])
-    h = task.dt
+    return ca.Function("f", [x, F], [drift + ca.DM(params.input_matrix()) @ F])
+
+
+def _rk4(ca: Any, task: Task) -> Any:
+    """x_{k+1} = phi(x_k, F_k): one Runge-Kutta step per sample."""
+    f, h = _derivative(ca, task), task.dt
+    x, F = ca.SX.sym("x", N_STATE), ca.SX.sym("F", N_INPUT)
     k1 = f(x, F)
     k2 = f(x + h / 2 * k1, F)
     k3 = f(x + h / 2 * k2, F)
     k4 = f(x + h * k3, F)
     return ca.Function("phi", [x, F], [x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
+
+
+class DoMpcPolicy:
+    """do-mpc as its users set it up: collocation, IPOPT, box limits; it cannot bound the input rate."""
+
+    def __init__(self, task: Task, horizon: int = 25) -> None:
+        self.task, self.horizon = task, horizon
+        self._window = np.zeros((horizon + 1, N_STATE))
+        self._mpc = self._set_up()
+
+    def _set_up(self) -> Any:
+        import casadi as ca
+        import do_mpc
+
+        task, N = self.task, self.horizon
+        model = do_mpc.model.Model("continuous")
+        x, u = model.set_variable("_x", "x", (N_STATE, 1)), model.set_variable("_u", "u", (N_INPUT, 1))
+        r = model.set_variable("_tvp", "r", (N_STATE, 1))
+        model.set_rhs("x", _derivative(ca, task)(x, u + task.hover_force))
+        model.setup()
+        mpc = do_mpc.controller.MPC(model)
+        mpc.settings.n_horizon, mpc.settings.t_step, mpc.settings.store_full_solution = N, task.dt, False
+        mpc.settings.supress_ipopt_output()
+        Q, R = task.weights.Q_matrix(), task.weights.R_matrix()
+        P = dare(*hover_pair(task.params, task.dt), Q, R)
+        mpc.set_objective(
+            mterm=ca.bilin(ca.DM(P), x - r, x - r),
+            lterm=ca.bilin(ca.DM(Q), x - r, x - r) + ca.bilin(ca.DM(R), u, u),
+        )
+        mpc.bounds["lower", "_u", "u"] = -task.hover_force
+        mpc.bounds["upper", "_u", "u"] = task.force_max - task.hover_force
+        template = mpc.get_tvp_template()
+
+        def window(t: float) -> Any:
+            for i in range(N + 1):
+                template["_tvp", i, "r"] = self._window[i]
+            return template
+
+        mpc.set_tvp_fun(window)
+        mpc.setup()
+        return mpc
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[Any, Any]:
+        """One decision for one vehicle."""
+        view = self.task.layout.decode(observation[0])
+        x_0 = np.concatenate([np.zeros(3), view.V_B, view.Theta, view.Omega])
+        self._window[:] = _references(view, self.horizon)
+        if state is None or (episode_start is not None and np.any(episode_start)):
+            self._mpc.reset_history()
+            self._mpc.x0 = x_0
+            self._mpc.set_initial_guess()
+        u = self._mpc.make_step(x_0.reshape(-1, 1)).reshape(1, -1)
+        hover = self.task.hover_force
+        return actions_from_forces(u + hover, hover, self.task.force_max), True
+
+
+def _references(view: Any, N: int) -> Array:
+    """Rows [p_ref; v_ref; 0 0 psi_ref; 0] of a decoded observation, (N+1, 12)."""
+    r = np.zeros((N + 1, N_STATE))
+    r[:, :6] = view.preview[: N + 1, :6]
+    r[:, 8] = np.arctan2(view.preview[: N + 1, 6], view.preview[: N + 1, 7])
+    return r

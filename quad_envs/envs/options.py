@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 
@@ -24,39 +24,6 @@ _NUMBERS = (
 _MOST_STEPS = 1_000_000  # control periods of an episode; its tables are made at reset
 RANDOMIZABLE = ("mass", "inertia", "arm", "kappa", "rotor_rate", "drag")
 _Triple = tuple[float, float, float]
-
-
-class TrackingKwargs(TypedDict, total=False):
-    """The keyword arguments, for type checkers; `TrackingOptions` has their meaning and defaults."""
-
-    env_id: str
-    mass: float
-    gravity: float
-    inertia: _Triple
-    arm: float
-    yaw_moment: float
-    rotor_rate: float
-    drag: float
-    kappa: float
-    rate_limit: float
-    tilt_limit: float
-    velocity_limit: float
-    position_limit: tuple[_Triple, _Triple] | None
-    Q: float | tuple[float, ...]
-    R: float | tuple[float, ...]
-    reference: str | Reference
-    start: tuple[float, ...]
-    start_box: float | tuple[float, ...]
-    disturbance: str | Disturbance | None
-    reveal_disturbance: bool
-    sensor_noise: float | tuple[float, float, float, float]
-    randomize: float | Mapping[str, float]
-    preview: int
-    dt: float
-    substeps: int
-    time_limit: float
-    lost_distance: float
-    reward: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
