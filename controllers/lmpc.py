@@ -29,7 +29,7 @@ def _decide_rows(
     commands: Array,
     kept: Array,
     report: IntArray,
-    which: IntArray,
+    which: IntArray | None,
     A: Array,
     B: Array,
     data: MpcData,

@@ -151,7 +151,7 @@ class Mpc(ABC):
         self._guess_stages = self.horizon if guess else 0
         self._keep_from = 1 + N_INPUT * self.horizon + (ESTIMATOR_SIZE if options.reject_disturbance else 0)
         self.memory_size = self._keep_from + (1 + N_STATE * (self.horizon + 1) if guess else 0)
-        self._workspace: tuple[IntArray, Array, Workspace] | None = None
+        self._workspace: tuple[IntArray | None, Array, Workspace] | None = None
         self._backend: Backend | None = None
 
     def decide(
@@ -193,11 +193,11 @@ class Mpc(ABC):
     def _keep(self, level: int, kept: Array, s: Scratch) -> None:  # noqa: B027  most flavours keep nothing
         """Write what the flavour remembers."""
 
-    def _scratch(self) -> tuple[IntArray, Array, Workspace]:
-        """Zeros for a kernel, the flat buffer, and the solver's memory; made at the first decision."""
+    def _scratch(self) -> tuple[IntArray | None, Array, Workspace]:
+        """What `begin_row` takes for the estimator, the flat buffer, the solver's memory; made at need."""
         if self._workspace is None:
             self._workspace = (
-                np.zeros(1, np.int64),
+                np.zeros(1, np.int64) if self.options.reject_disturbance else None,
                 np.zeros(buffer_size(self.horizon, *self._sizes())),
                 make_workspace(self.horizon, len(self._data.normal), self._pairs),
             )

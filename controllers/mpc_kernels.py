@@ -226,14 +226,17 @@ def begin_row(
     last: Array,
     revealed: Array,
     memory: Array,
-    which: IntArray,
+    which: IntArray | None,
     data: MpcData,
     s: Scratch,
 ) -> None:
-    """One sample's problem but for the model: disturbance, equilibrium, state, reference, bounds, rows."""
+    """One sample's problem but for the model: disturbance, equilibrium, state, reference, bounds, rows.
+
+    Without an estimator `which` is None, and its code is not even compiled; else zeros, (1,).
+    """
     for i in range(N_DISTURBANCE):
         s.estimate[i] = 0.0
-    if data.gain > 0.0:
+    if which is not None:
         kept = memory[1 + N_INPUT * s.c.shape[0] :]
         update_estimate(
             plant, kept, data.gain, data.coefficients, data.dt, data.force_max, s.estimate, s.work, which

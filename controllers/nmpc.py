@@ -192,7 +192,7 @@ def _decide_rows(
     commands: Array,
     kept: Array,
     report: IntArray,
-    which: IntArray,
+    which: IntArray | None,
     passes: int,
     inertial: bool,
     keep_from: int,

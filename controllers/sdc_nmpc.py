@@ -70,7 +70,7 @@ def _decide_rows(
     commands: Array,
     kept: Array,
     report: IntArray,
-    which: IntArray,
+    which: IntArray | None,
     alpha: float,
     relinearisations: int,
     sdre_weight: bool,
