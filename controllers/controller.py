@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol
+from abc import ABC, abstractmethod
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -144,3 +145,30 @@ def raise_non_finite(code: int) -> None:
     row, argument = divmod(code, len(_NAMES))
     remedy = "start from zeros and pass on what decide returned" if argument == 4 else "check the observation"
     raise ValueError(f"{_NAMES[argument]} of vehicle {row} is not finite; {remedy}")
+
+
+class FeedbackLaw(ABC):
+    """A controller without memory, decided in one compiled call; a window of one row will do."""
+
+    memory_size = 0
+
+    def decide(
+        self,
+        plant: ArrayLike,
+        window: ArrayLike,
+        last_command: ArrayLike,
+        disturbance: ArrayLike,
+        memory: ArrayLike,
+    ) -> Decision:
+        """One command per vehicle; see `Controller.decide`."""
+        arrays = as_rows(plant, window, last_command, disturbance, memory, 1, 0)
+        n = len(arrays[0])
+        command, report = np.empty((n, N_INPUT)), np.empty((2, n), np.int64)
+        bad = self._decide_rows(*arrays, command, report)
+        if bad >= 0:
+            raise_non_finite(bad)
+        return Decision(command, np.empty((n, 0)), report[0], report[1])
+
+    @abstractmethod
+    def _decide_rows(self, *arrays: Any) -> int:
+        """Fill commands and report; -1, or the code of the first argument that is not finite."""

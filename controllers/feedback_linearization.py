@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from quad_envs._numba import kernel
 from quad_envs.parameters import (
@@ -26,7 +26,7 @@ from quad_envs.parameters import (
 from quad_envs.rotations import sincos, wrap_angle_scalar
 from quad_envs.tasks import Task
 
-from .controller import Decision, as_rows, first_non_finite, raise_non_finite
+from .controller import FeedbackLaw, first_non_finite
 from .fallback import HOVER, NONE, limit_command
 from .mpc import Frame, require_choice
 from .ocp import IntArray
@@ -128,7 +128,7 @@ def _decide_rows(
     return bad
 
 
-class FeedbackLinearization:
+class FeedbackLinearization(FeedbackLaw):
     """PD laws on position and attitude after cancelling the nonlinear terms.
 
     Deviation:
@@ -149,8 +149,6 @@ class FeedbackLinearization:
     Raises:
         ValueError: If a gain is not positive and finite, or the frame is unknown.
     """
-
-    memory_size = 0
 
     def __init__(
         self,
@@ -179,20 +177,7 @@ class FeedbackLinearization:
         )
         self._scratch = np.empty((2, N_INPUT))
 
-    def decide(
-        self,
-        plant: ArrayLike,
-        window: ArrayLike,
-        last_command: ArrayLike,
-        disturbance: ArrayLike,
-        memory: ArrayLike,
-    ) -> Decision:
-        """One command per vehicle; see `Controller.decide`. A window of one row will do."""
-        arrays = as_rows(plant, window, last_command, disturbance, memory, 1, 0)
-        n = len(arrays[0])
-        command, report = np.empty((n, N_INPUT)), np.empty((2, n), np.int64)
+    def _decide_rows(self, *arrays: Any) -> int:
         preview = self.horizon > 0 and arrays[1].shape[1] > 1
-        bad = _decide_rows(*arrays, command, report, self._gains, preview, *self._constants, self._scratch)
-        if bad >= 0:
-            raise_non_finite(bad)
-        return Decision(command, np.empty((n, 0)), report[0], report[1])
+        arguments: tuple[Any, ...] = (*arrays, self._gains, preview, *self._constants, self._scratch)
+        return _decide_rows(*arguments)

@@ -6,13 +6,12 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from quad_envs._numba import kernel
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 from quad_envs.tasks import Task
 
-from .controller import Decision, as_rows, first_non_finite, raise_non_finite
+from .controller import FeedbackLaw, first_non_finite
 from .disturbance import feed_forward
 from .fallback import CLIPPED_SDRE, HOVER, NONE, limit_command
 from .linalg import copy
@@ -103,7 +102,7 @@ def _decide_rows(
     return bad
 
 
-class Sdre:
+class Sdre(FeedbackLaw):
     """du = -K(x) (x - r_0) with K(x) from the Riccati equation of the pair at x, clipped. No preview.
 
     `fallback` is CLIPPED_SDRE where the equation has no solution and the gain at hover is taken instead.
@@ -119,7 +118,6 @@ class Sdre:
     """
 
     horizon = 0
-    memory_size = 0
 
     def __init__(
         self,
@@ -158,23 +156,9 @@ class Sdre:
         )
         self._scratch = np.empty((_MATRICES + 2, N_STATE, N_STATE))
 
-    def decide(
-        self,
-        plant: ArrayLike,
-        window: ArrayLike,
-        last_command: ArrayLike,
-        disturbance: ArrayLike,
-        memory: ArrayLike,
-    ) -> Decision:
-        """One command per vehicle; see `Controller.decide`."""
-        arrays = as_rows(plant, window, last_command, disturbance, memory, 1, 0)
-        n = len(arrays[0])
-        command, report = np.empty((n, N_INPUT)), np.empty((2, n), np.int64)
-        arguments: tuple[Any, ...] = (*arrays, command, report, *self._constants, self._scratch)
-        bad = _decide_rows(*arguments)
-        if bad >= 0:
-            raise_non_finite(bad)
-        return Decision(command, np.empty((n, 0)), report[0], report[1])
+    def _decide_rows(self, *arrays: Any) -> int:
+        arguments: tuple[Any, ...] = (*arrays, *self._constants, self._scratch)
+        return _decide_rows(*arguments)
 
 
 class Lqr(Sdre):
