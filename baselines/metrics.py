@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quad_envs.constraints import TOLERANCE, constraint_names
+from quad_envs.constraints import TOLERANCE
 from quad_envs.parameters import POSITION, Array
 
 from .rollout import Episode
@@ -103,7 +103,7 @@ def measure(episode: Episode) -> Record:
         clipped_sdre=int(episode.fallbacks[3]),
         hover=int(episode.fallbacks[4]),
         iterations_max=episode.worst_iterations,
-        worst_violation=dict(zip(constraint_names(task.limits), excess.tolist(), strict=True)),
+        worst_violation=dict(zip(task.constraint_names, excess.tolist(), strict=True)),
         agent=episode.agent,
     )
 

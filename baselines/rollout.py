@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from quad_envs.constraints import forces_from_actions
 from quad_envs.observations import N_REFERENCE
 from quad_envs.parameters import Array
-from quad_envs.tasks import Task
+from quad_envs.tasks import BaseTask
 
 from .environments import require_own_task
 from .policy import N_FALLBACKS, Actions, Counts, Policy, PolicyState
@@ -31,7 +31,7 @@ _WARM_UP_CALLS = 2  # the first compiles, the second takes the path with a state
 class Episode(NamedTuple):
     """One flight of T control periods. Row k of what is per step belongs to the step from k to k + 1."""
 
-    task: Task  # as flown: with the time limit that Gymnasium set, where that one is shorter
+    task: BaseTask  # as flown: with the time limit that Gymnasium set, where that one is shorter
     seed: int
     states: Array  # (T+1, 16), true plant [p, V_B, Theta, Omega, F]
     references: Array  # (T+1, 8), p_ref, v_ref, sin psi_ref, cos psi_ref
@@ -63,7 +63,7 @@ class _Recorder:
     """What n vehicles do in one round, collected step by step as arrays over the vehicles."""
 
     def __init__(
-        self, task: Task, seeds: Sequence[int], references: Array, agents: Sequence[str] = ()
+        self, task: BaseTask, seeds: Sequence[int], references: Array, agents: Sequence[str] = ()
     ) -> None:
         self.task, self.seeds, self.references = task, seeds, references
         n = len(seeds)
@@ -165,9 +165,9 @@ def _single_episodes(policy: Policy, env: Any, episodes: int, seed: int) -> Iter
         yield from recorder.episodes()
 
 
-def _flown_task(env: Any) -> Task:
+def _flown_task(env: Any) -> BaseTask:
     """The Task with the time limit of `gymnasium.make(..., max_episode_steps=n)`, as `make_vec` has it."""
-    task: Task = env.unwrapped.task
+    task: BaseTask = env.unwrapped.task
     limit = getattr(getattr(env, "spec", None), "max_episode_steps", None) or 0
     return replace(task, episode_steps=limit) if 0 < limit < task.episode_steps else task
 

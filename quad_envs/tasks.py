@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from .agent_observations import AgentLayout
 from .constraints import constraint_names
 from .observations import TrackingLayout
 from .parameters import Limits, QuadrotorParams, Weights
 
+_Triple = tuple[float, float, float]
+
 
 @dataclass(frozen=True, slots=True)
-class Task:
-    """What is known before the flight; all else reaches a policy through observations only."""
+class BaseTask:
+    """What every task has: the vehicle, its limits, the weights of the reward, time."""
 
     env_id: str = "quad/HelixTracking-v0"
     params: QuadrotorParams = field(default_factory=QuadrotorParams)  # nominal vehicle
@@ -19,7 +22,6 @@ class Task:
     weights: Weights = field(default_factory=Weights)  # of the stage cost in the reward
     dt: float = 0.05  # s, control period
     episode_steps: int = 200  # control periods until truncation
-    layout: TrackingLayout = field(default_factory=TrackingLayout)
     sensor_noise: tuple[float, float, float, float] = (
         0.0,
         0.0,
@@ -42,3 +44,37 @@ class Task:
     def force_max(self) -> float:
         """Rotor force of action +1, kappa m g, N."""
         return self.limits.kappa * self.params.weight
+
+
+@dataclass(frozen=True, slots=True)
+class Task(BaseTask):
+    """One vehicle follows a reference; all else reaches a policy through observations only."""
+
+    layout: TrackingLayout = field(default_factory=TrackingLayout)
+
+
+@dataclass(frozen=True, slots=True)
+class TeamTask(BaseTask):
+    """Several vehicles, of which each decides from its own observation."""
+
+    layout: AgentLayout = field(default_factory=AgentLayout)
+    mission: str = "formation"  # or "target-tracking", "estimation"
+    vehicles: int = 6
+    separation: float = 0.4  # m, d_s, smallest distance between two vehicles
+    crash_distance: float = 0.33  # m, d_crash, tip to tip
+    sensing_radius: float = 2.0  # m, R_s
+    formation_weight: float = 1.0  # of the formation error in the stage cost
+    sensor: str = ""  # of the target: "range" or "range-azimuth-elevation"; empty where there is none
+    sensor_sigma: _Triple = (0.1, 0.02, 0.02)  # m, rad, rad: range, azimuth, elevation
+    prior_velocity: _Triple = (0.0, 0.0, 0.0)  # m/s, of the target at the start; its position is p - slot
+    prior_sigma: tuple[float, float] = (3.0, 1.0)  # m, m/s, standard deviation of that guess, each axis
+
+    @property
+    def constraint_names(self) -> tuple[str, ...]:
+        """The vehicle's limits, then the distance between vehicles; none where vehicles run on rails."""
+        return () if self.mission == "estimation" else (*constraint_names(self.limits), "separation")
+
+    @property
+    def action_size(self) -> int:
+        """Numbers in an action: rotor commands, then the plan where it is shared; or an estimate."""
+        return 6 if self.mission == "estimation" else 4 + 6 * self.layout.plan
