@@ -1,0 +1,92 @@
+"""Sensors of the target: h, H, their singular points."""
+
+import numpy as np
+import pytest
+
+from quad_envs._numba import kernel
+from quad_envs.sensors import (
+    MIN_HORIZONTAL_SQUARED,
+    OVERHEAD,
+    SENSORS,
+    is_overhead,
+    jacobian,
+    jacobian_rows,
+    measure,
+    range_azimuth_elevation,
+    sensor_rows,
+)
+
+DIRECTIONS = np.random.default_rng(0).normal(0.0, 4.0, (200, 3))
+
+
+@kernel
+def compiled(d, z, H):
+    for i in range(len(d)):
+        z[i, 0], z[i, 1], z[i, 2] = measure(d[i, 0], d[i, 1], d[i, 2])
+        rows = jacobian_rows(d[i, 0], d[i, 1], d[i, 2])
+        for a in range(3):
+            H[i, a, 0], H[i, a, 1], H[i, a, 2] = rows[a]
+
+
+@kernel
+def overhead(d, sigma):
+    return is_overhead(d[0], d[1], d[2], sigma)
+
+
+def test_the_jacobian_agrees_with_central_differences():
+    far = DIRECTIONS[np.hypot(DIRECTIONS[:, 0], DIRECTIONS[:, 1]) > 0.5]
+    eps = 1e-5  # truncation 1e-10 / s^3, rounding 1e-11: both below the tolerance at s > 0.5 m
+    for a, step in enumerate(eps * np.eye(3)):
+        change = range_azimuth_elevation(far + step) - range_azimuth_elevation(far - step)
+        change[:, 1] = (change[:, 1] + np.pi) % (2.0 * np.pi) - np.pi
+        np.testing.assert_allclose(jacobian(far)[..., a], change / (2.0 * eps), atol=1e-8)
+
+
+def test_compiled_and_readable_sensor_agree():
+    singular = np.array(
+        [[0.0, 0.0, 0.0], [0.0, 0.0, -3.0], [0.0, 0.0, 3.0], [1e-5, 0.0, 1.0], [-1.0, -0.0, 0.0]]
+    )
+    d = np.concatenate([DIRECTIONS, singular])
+    z, H = np.empty((len(d), 3)), np.empty((len(d), 3, 3))
+    compiled(d, z, H)
+    np.testing.assert_allclose(z, range_azimuth_elevation(d), rtol=1e-15, atol=1e-15)
+    np.testing.assert_allclose(H, jacobian(d), rtol=1e-14, atol=1e-14)
+
+
+def test_range_and_angles_give_the_vector_back():
+    rho, az, el = range_azimuth_elevation(DIRECTIONS).T
+    back = rho * np.array([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), -np.sin(el)])
+    np.testing.assert_allclose(back.T, DIRECTIONS, atol=1e-13)
+
+
+def test_elevation_is_the_printed_arcsine():
+    rho, _, el = range_azimuth_elevation(DIRECTIONS).T
+    np.testing.assert_allclose(el, np.arcsin(-DIRECTIONS[:, 2] / rho), atol=1e-12)
+
+
+def test_elevation_is_positive_for_a_target_above():
+    assert range_azimuth_elevation([1.0, 0.0, -1.0])[2] == pytest.approx(np.pi / 4)
+
+
+def test_azimuth_knows_four_quadrants():
+    assert range_azimuth_elevation([-4.0, 3.0, 0.0])[1] == pytest.approx(2.50, abs=0.005)  # tan^-1 says -0.64
+
+
+@pytest.mark.parametrize("d", [(0.0, 0.0, 0.0), (0.0, 0.0, -5.0), (0.0, 0.0, 5.0)])
+def test_singular_points_have_finite_values(d):
+    assert np.isfinite(range_azimuth_elevation(d)).all()
+    assert np.abs(jacobian(d)).max() < 1.001 / np.sqrt(MIN_HORIZONTAL_SQUARED)
+
+
+def test_overhead_is_where_the_horizontal_distance_is_small_against_the_angle_noise():
+    limit = OVERHEAD * 0.02  # s / rho
+    for ratio, expected in ((0.99 * limit, True), (1.01 * limit, False), (0.0, True)):
+        d = 5.0 * np.array([0.6 * ratio, 0.8 * ratio, -np.sqrt(1.0 - ratio**2)])
+        assert overhead(d, 0.02) == expected
+    assert overhead(np.zeros(3), 0.0)
+
+
+def test_sensors_are_named():
+    assert [sensor_rows(sensor) for sensor in SENSORS] == [1, 3]
+    with pytest.raises(ValueError, match="unknown sensor 'rnage'; did you mean 'range'"):
+        sensor_rows("rnage")
