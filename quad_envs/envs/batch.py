@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,9 @@ from .kernel import (
     step_rows,
     task_vector,
 )
-from .options import CRASH_TILT, TrackingOptions
+from .options import TrackingOptions
+from .tables import disturbance_rows, draw_vehicle, reference_rows, stage_times
+from .vehicle_options import CRASH_TILT
 
 _step = entry_of(step_rows)
 
@@ -46,9 +47,9 @@ class TrackingBatch:
         self._disturbance: Disturbance | None = make_disturbance(options.disturbance)
         self._randomization = options.randomization()
         self._start, self._widths = options.start_state(), options.start_half_widths()
-        steps, dt, nodes = self.task.episode_steps, self.task.dt, 2 * options.substeps + 1
+        steps, dt = self.task.episode_steps, self.task.dt
         self._times: Array = dt * np.arange(steps + 1 + self.task.layout.preview, dtype=np.float64)
-        self._nodes: Array = dt * (np.arange(steps, dtype=np.float64)[:, None] + np.linspace(0.0, 1.0, nodes))
+        self._nodes = stage_times(self.task, options.substeps)
         self._noise = np.repeat(np.asarray(self.task.sensor_noise), 3)
         # A table that is the same in every episode is stored once.
         never = np.random.default_rng(0)
@@ -59,12 +60,14 @@ class TrackingBatch:
         )
         count = [n if is_random else 1 for is_random in random]
         self.references: Array = np.zeros((count[0], self._times.size, N_REFERENCE))
-        self.disturbances: Array = np.zeros((count[1], steps if self._disturbance else 0, nodes, 6))
+        self.disturbances: Array = np.zeros(
+            (count[1], steps if self._disturbance else 0, self._nodes.shape[1], 6)
+        )
         self.noises: Array = np.zeros((count[2], steps + 1 if random[2] else 0, N_STATE))
         if not random[0]:
-            self.references[0] = self._reference_rows(never)
+            self.references[0] = reference_rows(self._reference, self._times, never)
         if self._disturbance is not None and not random[1]:
-            self.disturbances[0] = self._disturbance_rows(self._disturbance, never)
+            self.disturbances[0] = disturbance_rows(self._disturbance, self._nodes, dt, never)
         self._random = random
         self._which: NDArray[np.int64] = np.zeros((3, n), dtype=np.int64)
         for table in range(3):
@@ -97,16 +100,16 @@ class TrackingBatch:
         """
         start = None if not options else self._start_from(options)
         state = self._start + self._widths * rng.uniform(-1.0, 1.0, N_STATE)
-        vehicle, force_max = self._draw_vehicle(rng)
+        vehicle, force_max = draw_vehicle(self.task, self._randomization, rng)
         row = self.rows[i]
         row[:] = 0.0
         row[PLANT] = [*state, *[self.task.hover_force] * 4] if start is None else start
         row[COMMAND] = self.task.hover_force
         row[COEFFICIENTS], row[FORCE_MAX] = vehicle, force_max
         if self._random[0]:
-            self.references[i] = self._reference_rows(rng)
+            self.references[i] = reference_rows(self._reference, self._times, rng)
         if self._disturbance is not None and self._random[1]:
-            self.disturbances[i] = self._disturbance_rows(self._disturbance, rng)
+            self.disturbances[i] = disturbance_rows(self._disturbance, self._nodes, self.task.dt, rng)
         if self._random[2]:
             rng.standard_normal(out=self.noises[i])
             self.noises[i] *= self._noise
@@ -150,44 +153,6 @@ class TrackingBatch:
                 f"action{where} is {actions.reshape(-1)[bad]}; actions must be finite numbers in [-1, 1]. "
                 "The environment has not moved."
             )
-
-    def _reference_rows(self, rng: np.random.Generator) -> Array:
-        rows = np.asarray(self._reference.rows(self._times, rng), dtype=np.float64)
-        if rows.shape != (self._times.size, N_REFERENCE):
-            raise ValueError(
-                f"reference {self._reference!r} must give rows of shape {(self._times.size, N_REFERENCE)}, "
-                f"got {rows.shape}"
-            )
-        if not np.isfinite(rows).all():
-            k = int(np.argmin(np.isfinite(rows).all(axis=1)))
-            raise ValueError(f"reference {self._reference!r} is not finite at t = {self._times[k]:g} s")
-        return rows
-
-    def _disturbance_rows(self, disturbance: Disturbance, rng: np.random.Generator) -> Array:
-        rows = np.asarray(disturbance.values(self._nodes, rng), dtype=np.float64)
-        if rows.shape != (*self._nodes.shape, 6):
-            raise ValueError(
-                f"disturbance {disturbance!r} must give values of shape {(*self._nodes.shape, 6)}, "
-                f"got {rows.shape}"
-            )
-        if not np.isfinite(rows).all():
-            k = int(np.argmin(np.isfinite(rows).all(axis=(1, 2))))
-            raise ValueError(f"disturbance {disturbance!r} is not finite at t = {k * self.task.dt:g} s")
-        return rows
-
-    def _draw_vehicle(self, rng: np.random.Generator) -> tuple[Array, float]:
-        """Coefficients and rotor saturation of the true vehicle."""
-        params, kappa = self.task.params, self.task.limits.kappa
-        if self._randomization:
-            change = {
-                name: 1.0 + spread * rng.uniform(-1.0, 1.0, 3 if name == "inertia" else None)
-                for name, spread in self._randomization.items()
-            }
-            kappa *= float(change.pop("kappa", 1.0))
-            inertia = np.asarray(params.inertia) * change.pop("inertia", 1.0)
-            scaled = {name: getattr(params, name) * float(factor) for name, factor in change.items()}
-            params = replace(params, inertia=tuple(inertia.tolist()), **scaled)
-        return params.coefficients(), kappa * self.task.params.weight
 
     def _start_from(self, options: Mapping[str, Any]) -> Array:
         unknown = sorted(set(options) - {"state"})

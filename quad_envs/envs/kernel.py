@@ -17,7 +17,7 @@ from ..observations import N_OWN, encode_own, encode_preview
 from ..parameters import N_COEFFICIENTS, Array
 from ..reward import stage_cost_kernel
 from ..tasks import Task
-from .options import CRASH_TILT
+from .vehicle_options import CRASH_TILT
 
 # Entries of a vehicle's row.
 PLANT = slice(0, 16)  # [p, V_B, Theta, Omega, F]

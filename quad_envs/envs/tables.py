@@ -1,0 +1,84 @@
+"""What is drawn or tabulated at reset, for one vehicle or many: references, disturbances, the vehicle itself.
+
+Everything that comes from a user's object is checked here, so that the compiled step reads only good rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ..disturbances import Disturbance
+from ..observations import N_REFERENCE
+from ..parameters import Array
+from ..references import Reference
+from ..tasks import BaseTask
+
+
+def reference_rows(reference: Reference, times: Array, rng: np.random.Generator) -> Array:
+    """Reference rows at times (n,), (n, 8).
+
+    Raises:
+        ValueError: If the reference gives another shape or a number that is not finite.
+    """
+    return checked_rows("reference", reference, reference.rows(times, rng), times, N_REFERENCE)
+
+
+def checked_rows(kind: str, source: object, rows: Any, times: Array, width: int) -> Array:
+    """Rows that a user's object gave for times (n,), as a float64 array (n, width).
+
+    Raises:
+        ValueError: If the shape is another or a number is not finite.
+    """
+    found = np.asarray(rows, dtype=np.float64)
+    if found.shape != (times.size, width):
+        raise ValueError(
+            f"{kind} {source!r} must give rows of shape {(times.size, width)}, got {found.shape}"
+        )
+    if not np.isfinite(found).all():
+        k = int(np.argmin(np.isfinite(found).all(axis=1)))
+        raise ValueError(f"{kind} {source!r} is not finite at t = {times[k]:g} s")
+    return found
+
+
+def disturbance_rows(disturbance: Disturbance, nodes: Array, dt: float, rng: np.random.Generator) -> Array:
+    """Disturbances at the stage times nodes (n_steps, n_nodes), (n_steps, n_nodes, 6).
+
+    Raises:
+        ValueError: If the disturbance gives another shape or a number that is not finite.
+    """
+    rows = np.asarray(disturbance.values(nodes, rng), dtype=np.float64)
+    if rows.shape != (*nodes.shape, 6):
+        raise ValueError(
+            f"disturbance {disturbance!r} must give values of shape {(*nodes.shape, 6)}, got {rows.shape}"
+        )
+    if not np.isfinite(rows).all():
+        k = int(np.argmin(np.isfinite(rows).all(axis=(1, 2))))
+        raise ValueError(f"disturbance {disturbance!r} is not finite at t = {k * dt:g} s")
+    return rows
+
+
+def stage_times(task: BaseTask, substeps: int) -> Array:
+    """Times of the integrator's stages in each control period, (episode_steps, 2 substeps + 1), s."""
+    periods = np.arange(task.episode_steps, dtype=np.float64)[:, None]
+    return np.asarray(task.dt * (periods + np.linspace(0.0, 1.0, 2 * substeps + 1)))
+
+
+def draw_vehicle(
+    task: BaseTask, randomization: Mapping[str, float], rng: np.random.Generator
+) -> tuple[Array, float]:
+    """Coefficients and rotor saturation of a true vehicle; without randomization nothing is drawn."""
+    params, kappa = task.params, task.limits.kappa
+    if randomization:
+        change = {
+            name: 1.0 + spread * rng.uniform(-1.0, 1.0, 3 if name == "inertia" else None)
+            for name, spread in randomization.items()
+        }
+        kappa *= float(change.pop("kappa", 1.0))
+        inertia = np.asarray(params.inertia) * change.pop("inertia", 1.0)
+        scaled = {name: getattr(params, name) * float(factor) for name, factor in change.items()}
+        params = replace(params, inertia=tuple(inertia.tolist()), **scaled)
+    return params.coefficients(), kappa * task.params.weight

@@ -1,0 +1,224 @@
+"""What every environment lets choose about its vehicles: parameters, limits, weights, uncertainty, time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+
+from ..disturbances import Disturbance, make_disturbance
+from ..names import unknown_name
+from ..parameters import N_STATE, Limits, QuadrotorParams, Weights
+
+# Arguments that are one number; what it may be is checked where it is used.
+_NUMBERS = (
+    *("mass", "gravity", "arm", "yaw_moment", "rotor_rate", "drag", "kappa", "rate_limit", "tilt_limit"),
+    *("velocity_limit", "dt", "time_limit"),
+)
+_MOST_STEPS = 1_000_000  # control periods of an episode; its tables are made at reset
+RANDOMIZABLE = ("mass", "inertia", "arm", "kappa", "rotor_rate", "drag")
+CRASH_TILT = math.radians(85.0)  # rad; the Euler rates are singular at 90 degrees
+Triple = tuple[float, float, float]
+Options = TypeVar("Options", bound="VehicleOptions")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleOptions:
+    """The arguments that all environments share. `TrackingEnv` documents each."""
+
+    kind: ClassVar[str] = ""  # of environment, for messages
+
+    env_id: str = ""
+    mass: float = 0.8
+    gravity: float = 9.8
+    inertia: Triple = (0.0224, 0.0224, 0.0436)
+    arm: float = 0.165
+    yaw_moment: float = 0.002167
+    rotor_rate: float = 50.0
+    drag: float = 0.0
+    kappa: float = 1.0
+    rate_limit: float = math.inf
+    tilt_limit: float = math.inf
+    velocity_limit: float = math.inf
+    position_limit: tuple[Triple, Triple] | None = None
+    Q: float | tuple[float, ...] = 1.0
+    R: float | tuple[float, ...] = 1.0
+    disturbance: str | Disturbance | None = None
+    reveal_disturbance: bool = False
+    sensor_noise: float | tuple[float, float, float, float] = 0.0
+    randomize: float | Mapping[str, float] = 0.0
+    dt: float = 0.05
+    substeps: int = 5
+    time_limit: float = 10.0
+    reward: str = "bounded"
+
+    def __post_init__(self) -> None:
+        for name in _NUMBERS:
+            if not isinstance(getattr(self, name), int | float | np.integer | np.floating):
+                raise ValueError(f"{name} must be a number, got {getattr(self, name)!r}")
+        for name in ("dt", "time_limit"):
+            self.require_positive(name)
+        steps = self.time_limit / self.dt
+        if not 1.0 <= steps <= _MOST_STEPS or abs(steps - round(steps)) > 1e-6 * steps:
+            raise ValueError(
+                f"time_limit must be 1 to {_MOST_STEPS} whole control periods of dt = {self.dt} s, "
+                f"got {self.time_limit!r} s"
+            )
+        if not isinstance(self.reveal_disturbance, bool | np.bool_):
+            raise ValueError(f"reveal_disturbance must be True or False, got {self.reveal_disturbance!r}")
+        if not _is_vector(self.inertia):
+            raise ValueError(f"inertia must be three numbers (Jx, Jy, Jz), got {self.inertia!r}")
+        if self.position_limit is not None and not (
+            isinstance(self.position_limit, tuple)
+            and len(self.position_limit) == 2
+            and all(map(_is_vector, self.position_limit))
+        ):
+            raise ValueError(
+                "position_limit must be None or ((x, y, z) lower, (x, y, z) upper), "
+                f"got {self.position_limit!r}"
+            )
+        self.require_whole("substeps", 1)
+        if self.reward not in ("bounded", "quadratic"):
+            raise ValueError(f"reward must be 'bounded' or 'quadratic', got {self.reward!r}")
+        # Build what can be built, so that a bad value is refused here and not at the first reset.
+        self.randomization()
+        self.noise_deviations()
+        make_disturbance(self.disturbance)
+
+    def require_positive(self, name: str) -> None:
+        """Check that a field is a finite number > 0.
+
+        Raises:
+            ValueError: If it is not.
+        """
+        value = getattr(self, name)
+        if not (is_number(value) and value > 0.0):
+            raise ValueError(f"{name} must be a finite number > 0, got {value!r}")
+
+    def require_whole(self, name: str, least: int, most: float = math.inf) -> None:
+        """Check that a field is a whole number in a range.
+
+        Raises:
+            ValueError: If it is not.
+        """
+        value = getattr(self, name)
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
+            allowed = f">= {least}" if most == math.inf else f"from {least} to {most}"
+            raise ValueError(f"{name} must be an integer {allowed}, got {value!r}")
+
+    @classmethod
+    def from_kwargs(cls: type[Options], kwargs: Mapping[str, Any]) -> Options:
+        """Options from keyword arguments.
+
+        Raises:
+            TypeError: If a name is unknown; the message suggests the nearest one.
+        """
+        known = [field.name for field in fields(cls)]
+        for name in kwargs:
+            if name not in known:
+                known.remove("env_id")
+                raise TypeError(unknown_name(f"keyword argument of {cls.kind} environment", name, known))
+        return cls(**{name: _as_tuple(value) for name, value in kwargs.items()})
+
+    @property
+    def episode_steps(self) -> int:
+        """Control periods of an episode."""
+        return round(self.time_limit / self.dt)
+
+    def make_limits(self) -> Limits:
+        """The limits that are set."""
+        lower, upper = self.position_limit or ((-math.inf,) * 3, (math.inf,) * 3)
+        return Limits(
+            kappa=self.kappa,
+            rate=self.rate_limit,
+            tilt=self.tilt_limit,
+            velocity=self.velocity_limit,
+            position_lower=lower,
+            position_upper=upper,
+        )
+
+    def task_fields(self) -> dict[str, Any]:
+        """What each kind of Task has of these options."""
+        params = QuadrotorParams(
+            mass=self.mass,
+            gravity=self.gravity,
+            inertia=self.inertia,
+            arm=self.arm,
+            yaw_moment=self.yaw_moment,
+            rotor_rate=self.rotor_rate,
+            drag=self.drag,
+        )
+        return {
+            "env_id": self.env_id,
+            "params": params,
+            "limits": self.make_limits(),
+            "weights": Weights(Q=spread("Q", self.Q, N_STATE), R=spread("R", self.R, 4)),
+            "dt": self.dt,
+            "episode_steps": self.episode_steps,
+            "sensor_noise": self.noise_deviations(),
+            "reward": self.reward,
+        }
+
+    def noise_deviations(self) -> tuple[float, float, float, float]:
+        """Standard deviations of measured position, velocity, attitude and rates; one number is for all."""
+        values = spread("sensor_noise", self.sensor_noise, 4)
+        if not all(value >= 0.0 for value in values):
+            raise ValueError(f"sensor_noise must be >= 0, got {self.sensor_noise!r}")
+        return values[0], values[1], values[2], values[3]
+
+    def randomization(self) -> dict[str, float]:
+        """Parameter -> largest relative change of it at reset, only those that vary."""
+        if isinstance(self.randomize, Mapping):
+            ranges = dict(self.randomize)
+        else:
+            ranges = {name: self.randomize for name in RANDOMIZABLE if name != "drag" or self.drag > 0.0}
+        for name, value in ranges.items():
+            if name not in RANDOMIZABLE:
+                raise ValueError(f"randomize knows {', '.join(RANDOMIZABLE)}; got {name!r}")
+            if not (is_number(value) and 0.0 <= value < 1.0):
+                raise ValueError(f"randomize[{name!r}] is a relative spread in [0, 1), got {value!r}")
+            if name == "drag" and value > 0.0 and self.drag == 0.0:
+                raise ValueError(
+                    "randomize['drag'] varies the drag in proportion: give the env a drag > 0 first"
+                )
+        if self.kappa * (1.0 - ranges.get("kappa", 0.0)) <= 0.25 * (1.0 + ranges.get("mass", 0.0)):
+            raise ValueError(
+                f"randomize={self.randomize!r} would draw rotors too weak to hover at kappa = {self.kappa}"
+            )
+        return {name: float(value) for name, value in ranges.items() if value > 0.0}
+
+
+def is_number(value: object) -> bool:
+    """Whether it is a finite number."""
+    return isinstance(value, int | float | np.integer | np.floating) and math.isfinite(value)
+
+
+def _is_vector(value: object) -> bool:
+    """Whether it is three numbers, possibly infinite."""
+    return (
+        isinstance(value, tuple)
+        and len(value) == 3
+        and all(isinstance(entry, int | float | np.integer | np.floating) for entry in value)
+    )
+
+
+def _as_tuple(value: Any) -> Any:
+    """Lists and arrays from configuration files and the command line become tuples."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    return tuple(_as_tuple(entry) for entry in value) if isinstance(value, list | tuple) else value
+
+
+def spread(name: str, value: float | tuple[float, ...], length: int) -> tuple[float, ...]:
+    """A number for all entries, or one per entry.
+
+    Raises:
+        ValueError: If it is neither.
+    """
+    values = value if isinstance(value, tuple) else (value,) * length
+    if len(values) != length or not all(map(is_number, values)):
+        raise ValueError(f"{name} must be one finite number or {length} of them, got {value!r}")
+    return tuple(float(entry) for entry in values)
