@@ -59,6 +59,19 @@ class SetPoint:
 
 
 @dataclass(frozen=True, slots=True)
+class Line:
+    """A straight line from the origin at constant velocity."""
+
+    velocity: tuple[float, float, float] = (0.5, 0.0, -0.2)  # m/s
+    random: ClassVar[bool] = False
+
+    def rows(self, t: Array, rng: np.random.Generator) -> Array:
+        """Reference rows, (n, 8)."""
+        v = np.broadcast_to(np.asarray(self.velocity, dtype=np.float64), (t.size, 3))
+        return pack_rows(t[:, None] * v, v)
+
+
+@dataclass(frozen=True, slots=True)
 class Helix:
     """[R sin wt, R (1 - cos wt), vz t]: starts at the origin, descends for vz > 0."""
 
@@ -372,6 +385,9 @@ _BY_NAME: dict[str, Callable[[], Reference]] = {
     "lemniscate": Lemniscate,
     "racetrack": Racetrack,
     "random": RandomSmooth,
+    "line": Line,
+    "fast-line": lambda: Line((1.5, 0.0, -0.5)),
+    "slow-helix": lambda: Helix(2.0, 0.3, -0.1),
 }
 
 

@@ -9,6 +9,7 @@ from quad_envs.references import (
     Heading,
     Helix,
     Lemniscate,
+    Line,
     OutAndBack,
     Racetrack,
     RandomSmooth,
@@ -25,6 +26,7 @@ ALL = [
     SphericalSpiral(),
     OutAndBack(),
     Lemniscate(),
+    Line(),
     Racetrack(),
     RandomSmooth(),
 ]
@@ -128,3 +130,13 @@ def test_a_broken_csv_is_refused_with_its_line(tmp_path, text, message):
 def test_unknown_reference_name_lists_the_known_ones():
     with pytest.raises(ValueError, match="did you mean 'helix'"):
         make_reference("hleix")
+
+
+def test_leaders_of_teams_fly_at_the_speeds_of_the_text():
+    speed = {
+        name: np.linalg.norm(rows_of(make_reference(name), [0.0, 3.0])[:, 3:6], axis=1)
+        for name in ("line", "fast-line", "slow-helix")
+    }
+    np.testing.assert_allclose(speed["line"], 0.539, atol=5e-4)
+    np.testing.assert_allclose(speed["fast-line"], 1.58, atol=2e-3)
+    np.testing.assert_allclose(speed["slow-helix"], 0.61, atol=3e-3)
