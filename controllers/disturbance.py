@@ -151,7 +151,7 @@ def update_estimate(
         for i in range(N_DISTURBANCE):
             table[0, 0, k, i] = memory[1 + i] + memory[1 + N_DISTURBANCE + i]
     load_vehicle(w, 0, 1, predicted, memory[_COMMAND:], force_max, c, dt / _SUBSTEPS)
-    advance(w, 1, 1, _SUBSTEPS, dt / _SUBSTEPS, table, which, which)
+    advance(w, 1, 1, 0, _SUBSTEPS, dt / _SUBSTEPS, table, which, which)
     if not (store_vehicle(w, 0, 1, predicted) and _residual(plant, predicted, dt, c, correction)):
         return
     weight = 4.0 * c[HOVER_FORCE]

@@ -303,26 +303,28 @@ def advance(
     w: Array,
     stride: Int,
     lanes: int,
-    substeps: int,
+    first: int,
+    end: int,
     h: float,
     disturbances: Array,
     which: NDArray[np.int64],
     step: NDArray[np.int64],
 ) -> None:
-    """Integrate the loaded lanes over one control period.
+    """Integrate the loaded lanes over substeps first..end-1 of one control period.
 
     Args:
         w: Scratch with `lanes` loaded vehicles; the lanes up to `stride` must hold finite numbers.
         stride: 1 or LANES.
         lanes: Number of vehicles, <= stride.
-        substeps: RK4 steps in the control period.
+        first: First RK4 step, 0 at the beginning of the control period.
+        end: Number of the RK4 step to stop before.
         h: Length of one of them, s.
         disturbances: Tables (n_tables, n_steps, 2 substeps + 1, 6); n_steps = 0 means none.
         which: Table of each lane, (>= lanes,) int64.
         step: Control step of each lane, (>= lanes,) int64; the last row holds on.
     """
     disturbed = disturbances.shape[1] > 0
-    for s in range(substeps):
+    for s in range(first, end):
         if disturbed:
             _load_disturbance(w, stride, lanes, disturbances, which, step, 2 * s)
         _stage(w, stride, _DECAY_NONE, 1.0, 0.5 * h)
@@ -351,7 +353,7 @@ def _simulate(
 ) -> None:
     for j in range(plants.shape[0]):
         load_vehicle(w, 0, 1, plants[j], commands[j], force_max, coefficients, h)
-        advance(w, 1, 1, substeps, h, disturbances, which, step)
+        advance(w, 1, 1, 0, substeps, h, disturbances, which, step)
         store_vehicle(w, 0, 1, plants[j])
 
 

@@ -18,8 +18,10 @@ from .rotations import rotation_body_from_inertial, sincos, wrap_angle, wrap_ang
 
 
 @inline_kernel
-def stage_cost_kernel(x: Array, row: Array, command: Array, hover: float, Q: Array, R: Array) -> float:
-    """The stage cost l of one vehicle.
+def stage_cost_parts(
+    x: Array, row: Array, command: Array, hover: float, Q: Array, R: Array
+) -> tuple[float, float, float, float, float]:
+    """The stage cost l of one vehicle in parts: position, velocity, attitude, rates, effort; all >= 0.
 
     Args:
         x: State, (>= 12,).
@@ -30,7 +32,7 @@ def stage_cost_kernel(x: Array, row: Array, command: Array, hover: float, Q: Arr
         R: Diagonal, (4,).
 
     Returns:
-        l >= 0.
+        The parts, whose sum is l.
     """
     sf, cf = sincos(x[6])
     st, ct = sincos(x[7])
@@ -42,15 +44,24 @@ def stage_cost_kernel(x: Array, row: Array, command: Array, hover: float, Q: Arr
     e4 = x[4] - (sf * (st * forward + ct * vz) + cf * right)
     e5 = x[5] - (cf * (st * forward + ct * vz) - sf * right)
     e8 = wrap_angle_scalar(x[8] - np.arctan2(row[6], row[7]))
-    cost = Q[3] * e3 * e3 + Q[4] * e4 * e4 + Q[5] * e5 * e5
-    cost += Q[6] * x[6] * x[6] + Q[7] * x[7] * x[7] + Q[8] * e8 * e8
+    velocity = Q[3] * e3 * e3 + Q[4] * e4 * e4 + Q[5] * e5 * e5
+    attitude = Q[6] * x[6] * x[6] + Q[7] * x[7] * x[7] + Q[8] * e8 * e8
+    position, rates, effort = 0.0, 0.0, 0.0
     for i in range(3):
         e = x[i] - row[i]
-        cost += Q[i] * e * e + Q[9 + i] * x[9 + i] * x[9 + i]
+        position += Q[i] * e * e
+        rates += Q[9 + i] * x[9 + i] * x[9 + i]
     for i in range(4):
         du = command[i] - hover
-        cost += R[i] * du * du
-    return float(cost)
+        effort += R[i] * du * du
+    return position, velocity, attitude, rates, effort
+
+
+@inline_kernel
+def stage_cost_kernel(x: Array, row: Array, command: Array, hover: float, Q: Array, R: Array) -> float:
+    """The stage cost l of one vehicle; arguments as in `stage_cost_parts`."""
+    position, velocity, attitude, rates, effort = stage_cost_parts(x, row, command, hover, Q, R)
+    return float(position + velocity + attitude + rates + effort)
 
 
 def tracking_error(x: ArrayLike, rows: ArrayLike) -> Array:

@@ -79,7 +79,7 @@ def held_under(plant, command, task, disturbance, k):
     w, zero, out = np.zeros(SCRATCH_ROWS), np.zeros(1, dtype=np.int64), plant.copy()
     h = task.dt / SUBSTEPS
     load_vehicle(w, 0, 1, out, command, task.force_max, task.params.coefficients(), h)
-    advance(w, 1, 1, SUBSTEPS, h, table[None, None], zero, zero)
+    advance(w, 1, 1, 0, SUBSTEPS, h, table[None, None], zero, zero)
     store_vehicle(w, 0, 1, out)
     return out
 

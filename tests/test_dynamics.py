@@ -186,7 +186,7 @@ def test_a_block_of_lanes_equals_one_vehicle_at_a_time_bit_for_bit():
 def _block(plants, commands, coefficients, w, index, none):
     for j in range(LANES):
         load_vehicle(w, j, np.int64(LANES), plants[j], commands[j], 7.84, coefficients, 0.01)
-    advance(w, np.int64(LANES), LANES, 5, 0.01, none, index, index)
+    advance(w, np.int64(LANES), LANES, 0, 5, 0.01, none, index, index)
     for j in range(LANES):
         store_vehicle(w, j, np.int64(LANES), plants[j])
 

@@ -16,7 +16,7 @@ from ..dynamics import LANES, SCRATCH_ROWS, advance, load_vehicle, store_vehicle
 from ..observations import N_OWN, encode_own, encode_preview
 from ..parameters import N_COEFFICIENTS, Array
 from ..reward import stage_cost_kernel
-from ..tasks import Task
+from ..tasks import Task, TeamTask
 from .vehicle_options import CRASH_TILT
 
 # Entries of a vehicle's row.
@@ -30,18 +30,18 @@ VALUES = 44  # constraint values, one per named row, at most four
 ROW_SIZE = 48
 SCRATCH_SIZE = SCRATCH_ROWS * LANES + 4 * LANES + 16  # integrator, previous commands, one measured plant
 
-# Entries of the task vector.
-_DT, _SUBSTEPS, _HOVER, _ACTION_MAX, _EPISODE_STEPS, _PREVIEW, _QUADRATIC, _LOST = range(8)
-_SEES_POSITION, _SEES_DISTURBANCE, _TILT, _VELOCITY, _HAS_POSITION, _RATE_STEP, _CRASH_TILT = range(8, 15)
-_LOWER = slice(15, 18)
-_UPPER = slice(18, 21)
-_Q = slice(21, 33)
-_R = slice(33, 37)
+# Entries of the task vector. It ends with the diagonals of Q and R.
+DT, SUBSTEPS, HOVER, ACTION_MAX, EPISODE_STEPS, PREVIEW, QUADRATIC, LOST = range(8)
+SEES_POSITION, SEES_DISTURBANCE, TILT, VELOCITY, HAS_POSITION, RATE_STEP, TILT_OF_CRASH = range(8, 15)
+LOWER = slice(15, 18)
+UPPER = slice(18, 21)
+WEIGHT_Q = slice(21, 33)
+WEIGHT_R = slice(33, 37)
 
 _BLOCK_FROM = 8  # rows from which a block of lanes is faster than one row at a time
 
 
-def task_vector(task: Task, substeps: int, lost_distance: float) -> Array:
+def task_vector(task: Task | TeamTask, substeps: int, lost_distance: float) -> Array:
     """The task in the form that the kernels read."""
     limits = task.limits
     return np.array(
@@ -78,27 +78,27 @@ def _hinge(row: Array, index: int, value: float, scale: float) -> float:
 
 
 @kernel
-def _violation_cost(row: Array, previous: Array, task: Array) -> float:
+def violation_cost(row: Array, previous: Array, task: Array) -> float:
     """Sum of hinge / scale over the limits, `constraints.constraint_values` in compiled form."""
     index, cost = 0, 0.0
-    if task[_TILT] < np.inf:
-        cost += _hinge(row, index, max(abs(row[6]), abs(row[7])) - task[_TILT], TILT_SCALE)
+    if task[TILT] < np.inf:
+        cost += _hinge(row, index, max(abs(row[6]), abs(row[7])) - task[TILT], TILT_SCALE)
         index += 1
-    if task[_VELOCITY] < np.inf:
+    if task[VELOCITY] < np.inf:
         speed = max(abs(row[3]), max(abs(row[4]), abs(row[5])))
-        cost += _hinge(row, index, speed - task[_VELOCITY], VELOCITY_SCALE)
+        cost += _hinge(row, index, speed - task[VELOCITY], VELOCITY_SCALE)
         index += 1
-    if task[_HAS_POSITION] > 0.0:
+    if task[HAS_POSITION] > 0.0:
         outside = -np.inf
         for i in range(3):
-            outside = max(outside, max(task[_LOWER][i] - row[i], row[i] - task[_UPPER][i]))
+            outside = max(outside, max(task[LOWER][i] - row[i], row[i] - task[UPPER][i]))
         cost += _hinge(row, index, outside, POSITION_SCALE)
         index += 1
-    if task[_RATE_STEP] < np.inf:
+    if task[RATE_STEP] < np.inf:
         change = 0.0
         for i in range(4):
             change = max(change, abs(row[COMMAND][i] - previous[i]))
-        cost += _hinge(row, index, change - task[_RATE_STEP], task[_RATE_STEP])
+        cost += _hinge(row, index, change - task[RATE_STEP], task[RATE_STEP])
     return cost
 
 
@@ -110,14 +110,14 @@ def _judge(row: Array, reference: Array, previous: Array, finite: bool, task: Ar
         off += (row[i] - reference[i]) ** 2
     crashed = (
         not finite
-        or abs(row[6]) >= task[_CRASH_TILT]
-        or abs(row[7]) >= task[_CRASH_TILT]
-        or off > task[_LOST] * task[_LOST]
+        or abs(row[6]) >= task[TILT_OF_CRASH]
+        or abs(row[7]) >= task[TILT_OF_CRASH]
+        or off > task[LOST] * task[LOST]
     )
-    stage_cost = stage_cost_kernel(row, reference, row[COMMAND], task[_HOVER], task[_Q], task[_R])
-    cost = _violation_cost(row, previous, task)
+    stage_cost = stage_cost_kernel(row, reference, row[COMMAND], task[HOVER], task[WEIGHT_Q], task[WEIGHT_R])
+    cost = violation_cost(row, previous, task)
     v = min(1.0, cost)
-    if task[_QUADRATIC] > 0.0:
+    if task[QUADRATIC] > 0.0:
         row[REWARD] = -stage_cost - v
     else:
         row[REWARD] = 0.0 if crashed else (1.0 - v) / (1.0 + stage_cost)
@@ -125,7 +125,46 @@ def _judge(row: Array, reference: Array, previous: Array, finite: bool, task: Ar
     row[COST] = cost
     row[VIOLATED] = 1.0 if cost > 0.0 else 0.0
     row[CRASHED] = 1.0 if crashed else 0.0
-    row[TRUNCATED] = 1.0 if row[STEP] >= task[_EPISODE_STEPS] and not crashed else 0.0
+    row[TRUNCATED] = 1.0 if row[STEP] >= task[EPISODE_STEPS] and not crashed else 0.0
+
+
+@inline_kernel
+def measure_plant(row: Array, noise: Array, measured: Array) -> None:
+    """The plant of a row as its own sensors see it.
+
+    Args:
+        row: The vehicle.
+        noise: Its measurement errors, (n_steps, 12); no steps for none.
+        measured: Result, (16,).
+    """
+    for i in range(16):
+        measured[i] = row[i]
+    if noise.shape[0] > 0:
+        k = min(int(row[STEP]), noise.shape[0] - 1)
+        for i in range(12):
+            measured[i] += noise[k, i]
+
+
+@inline_kernel
+def encode_vehicle(
+    row: Array, measured: Array, disturbance: Array, task: Array, out: NDArray[np.float32]
+) -> int:
+    """Write own, position and disturbance of an observation; returns where they end."""
+    encode_own(out, measured, row[COMMAND])
+    start = N_OWN
+    if task[SEES_POSITION] > 0.0:
+        for i in range(3):
+            out[start + i] = measured[i]
+        start += 3
+    if task[SEES_DISTURBANCE] > 0.0:
+        k = int(row[STEP])
+        for i in range(6):
+            out[start + i] = 0.0
+        if 0 < disturbance.shape[0] and k < disturbance.shape[0]:
+            for i in range(6):
+                out[start + i] = disturbance[k, disturbance.shape[1] // 2, i]
+        start += 6
+    return start
 
 
 @kernel
@@ -149,38 +188,21 @@ def observe(
         measured: Scratch, (16,).
         out: (layout.size,) float32.
     """
-    k = int(row[STEP])
-    for i in range(16):
-        measured[i] = row[i]
-    if noise.shape[0] > 0:
-        for i in range(12):
-            measured[i] += noise[min(k, noise.shape[0] - 1), i]
-    encode_own(out, measured, row[COMMAND])
-    start = N_OWN
-    if task[_SEES_POSITION] > 0.0:
-        for i in range(3):
-            out[start + i] = measured[i]
-        start += 3
-    if task[_SEES_DISTURBANCE] > 0.0:
-        for i in range(6):
-            out[start + i] = 0.0
-        if 0 < disturbance.shape[0] and k < disturbance.shape[0]:
-            for i in range(6):
-                out[start + i] = disturbance[k, disturbance.shape[1] // 2, i]
-        start += 6
-    stages = int(task[_PREVIEW]) + 1
-    encode_preview(out, start, reference, min(k, reference.shape[0] - stages), stages, measured)
+    measure_plant(row, noise, measured)
+    start = encode_vehicle(row, measured, disturbance, task, out)
+    stages = int(task[PREVIEW]) + 1
+    encode_preview(out, start, reference, min(int(row[STEP]), reference.shape[0] - stages), stages, measured)
 
 
 @inline_kernel
-def _command(row: Array, actions: NDArray[np.floating], task: Array) -> None:
+def apply_action(row: Array, actions: NDArray[np.floating], task: Array) -> None:
     """Take an action over into the row; entries outside [-1, 1] are clipped and counted."""
     for i in range(4):
         action = float(actions[i])
         if action < -1.0 or action > 1.0:
             row[CLIPPED] += 1.0
             action = min(max(action, -1.0), 1.0)
-        row[COMMAND][i] = force_from_action(action, task[_HOVER], task[_ACTION_MAX])
+        row[COMMAND][i] = force_from_action(action, task[HOVER], task[ACTION_MAX])
 
 
 @kernel
@@ -220,8 +242,8 @@ def step_rows(
         for a in range(4):
             if not np.isfinite(actions[i, a]):
                 return 4 * i + a
-    substeps = int(task[_SUBSTEPS])
-    h = task[_DT] / substeps
+    substeps = int(task[SUBSTEPS])
+    h = task[DT] / substeps
     stride = np.int64(LANES) if n >= _BLOCK_FROM else np.int64(1)
     measured = scratch[scratch.size - 16 :]
     previous = scratch[scratch.size - 16 - 4 * LANES : scratch.size - 16].reshape(LANES, 4)
@@ -231,10 +253,10 @@ def step_rows(
             row = rows[first + j]
             for a in range(4):
                 previous[j, a] = row[COMMAND][a]
-            _command(row, actions[first + j], task)
+            apply_action(row, actions[first + j], task)
             steps[first + j] = int(row[STEP])
             load_vehicle(scratch, j, stride, row, row[COMMAND], row[FORCE_MAX], row[COEFFICIENTS], h)
-        advance(scratch, stride, lanes, substeps, h, disturbances, which[1, first:], steps[first:])
+        advance(scratch, stride, lanes, 0, substeps, h, disturbances, which[1, first:], steps[first:])
         for j in range(lanes):
             i = first + j
             row = rows[i]
