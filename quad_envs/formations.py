@@ -170,7 +170,7 @@ def _ranks_from_leader(slots: Array) -> Array:
     outward = np.where(y < y[0], slots[:, 0], -slots[:, 0])
     rank = np.empty(len(slots))
     rank[np.lexsort((outward, y))] = np.arange(len(slots))
-    return rank - rank[0]
+    return np.asarray(rank - rank[0])
 
 
 def _grid(n: int) -> Array:
