@@ -62,7 +62,7 @@ class Controller(Protocol):
         ...
 
 
-def _as_array(value: ArrayLike) -> Array:
+def as_array(value: ArrayLike) -> Array:
     """Contiguous, float64 and writeable: of any other kind numba would compile the kernels anew."""
     array = np.ascontiguousarray(value, dtype=np.float64)
     return array if array.flags.writeable else array.copy()
@@ -82,11 +82,11 @@ def as_rows(
     Raises:
         ValueError: If a shape is wrong; it says which and what is expected.
     """
-    plants = _as_array(plant)
-    windows = _as_array(window)
-    lasts = _as_array(last_command)
-    disturbances = _as_array(disturbance)
-    memories = _as_array(memory)
+    plants = as_array(plant)
+    windows = as_array(window)
+    lasts = as_array(last_command)
+    disturbances = as_array(disturbance)
+    memories = as_array(memory)
     n = len(plants)
     shape = windows.shape
     if (
@@ -113,7 +113,7 @@ def as_rows(
 
 
 @kernel
-def _finite(values: Array) -> bool:
+def all_finite(values: Array) -> bool:
     """Whether all numbers are finite; without a branch, so that it vectorises."""
     bad = 0
     for value in values:
@@ -127,15 +127,15 @@ def first_non_finite(
 ) -> int:
     """-1 if all arguments of `decide` are finite, else 5 row + index of the argument."""
     for j in range(plants.shape[0]):
-        if not _finite(plants[j]):
+        if not all_finite(plants[j]):
             return 5 * j
-        if not _finite(windows[j, :stages].reshape(-1)):
+        if not all_finite(windows[j, :stages].reshape(-1)):
             return 5 * j + 1
-        if not _finite(lasts[j]):
+        if not all_finite(lasts[j]):
             return 5 * j + 2
-        if not _finite(disturbances[j]):
+        if not all_finite(disturbances[j]):
             return 5 * j + 3
-        if not _finite(memories[j]):
+        if not all_finite(memories[j]):
             return 5 * j + 4
     return -1
 

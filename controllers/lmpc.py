@@ -41,12 +41,13 @@ def _decide_rows(
     bad = first_non_finite(plants, windows, lasts, disturbances, memories, N + 1)
     if bad >= 0:
         return bad
-    s = carve(buffer, N, 1, data.normals.shape[0], data.normal.shape[0], 0)
+    H, K = data.normals.shape[0], data.normal.shape[0]
+    s = carve(buffer, N, 1, H, K, 0)
     for j in range(plants.shape[0]):
         begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
         hold_trim(A, s.trim, s.c)
         has_plan = memories[j, 0] > 0.0
-        level, iterations = solve_row(A, B, data.Q, data.P, True, s.r, has_plan, data, s, ws)
+        level, iterations = solve_row(A, B, data.Q, data.P, True, s.r, has_plan, H, K, data, s, ws)
         end_row(level, plants[j], lasts[j], disturbances[j], memories[j], data, s, ws.u, commands[j], kept[j])
         report[0, j], report[1, j] = level, iterations
     return bad

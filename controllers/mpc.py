@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, VELOCITY, Array, Limits
-from quad_envs.tasks import Task
+from quad_envs.tasks import BaseTask, Task
 
 from .controller import Decision, as_rows, first_non_finite, raise_non_finite
 from .disturbance import ESTIMATOR_SIZE
@@ -102,7 +102,7 @@ def limit_rows(limits: Limits, margin: float, weight: float, horizon: int) -> tu
     return rows, np.where(outputs < POSITION.stop, outputs, -1).astype(np.int64)
 
 
-def _mpc_data(task: Task, horizon: int, options: MpcOptions) -> MpcData:
+def mpc_data(task: BaseTask, horizon: int, options: MpcOptions) -> MpcData:
     """The constants of a controller."""
     params, Q, R = task.params, task.weights.Q_matrix(), task.weights.R_matrix()
     if options.frame == "heading" and Q[0, 0] != Q[1, 1]:
@@ -146,7 +146,7 @@ class Mpc(ABC):
         self.task = task
         self.horizon = int(horizon)
         self.options = options
-        self._data = _mpc_data(task, self.horizon, options)
+        self._data = mpc_data(task, self.horizon, options)
         self._pairs = pairs
         self._guess_stages = self.horizon if guess else 0
         self._keep_from = 1 + N_INPUT * self.horizon + (ESTIMATOR_SIZE if options.reject_disturbance else 0)

@@ -293,11 +293,16 @@ def solve_row(
     stationary: bool,
     r: Array,
     has_plan: bool,
+    H: int,
+    K: int,
     data: MpcData,
     s: Scratch,
     ws: Workspace,
 ) -> tuple[int, int]:
     """Solve; hard rows that contradict each other become soft; failing that, without a plan, no constraints.
+
+    Only the first H normals and K rows count: where their number differs from vehicle to vehicle, the others
+    are left out.
 
     Returns:
         Fallback (PREVIOUS_PLAN and HOVER leave no plan in ws.u), and active-set iterations.
@@ -308,7 +313,7 @@ def solve_row(
     while True:
         status, count = solve_structured(
             A, B, s.c, Q, data.R, Q_f, stationary, s.x_0, r, s.lower, s.upper, rate_step, s.u_last,
-            s.normals, data.normal, data.stage, s.row_lower, s.row_upper, s.weight,
+            s.normals[:H], data.normal[:K], data.stage[:K], s.row_lower[:K], s.row_upper[:K], s.weight[:K],
             data.iteration_limit, ws,
         )  # fmt: skip
         iterations += count

@@ -205,7 +205,8 @@ def _decide_rows(
     bad = first_non_finite(plants, windows, lasts, disturbances, memories, N + 1)
     if bad >= 0:
         return bad
-    s = carve(buffer, N, N, data.normals.shape[0], data.normal.shape[0], N)
+    H, K = data.normals.shape[0], data.normal.shape[0]
+    s = carve(buffer, N, N, H, K, N)
     for j in range(plants.shape[0]):
         begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
         load_guess(memories[j], memories[j, keep_from:], data.heading, s)
@@ -213,7 +214,8 @@ def _decide_rows(
         for _ in range(passes):
             linearise_model(data, s)
             linearise_cost(inertial, data, s)
-            level, count = solve_row(s.A, s.B, s.Q, s.P, False, s.target, memories[j, 0] > 0.0, data, s, ws)
+            has_plan = memories[j, 0] > 0.0
+            level, count = solve_row(s.A, s.B, s.Q, s.P, False, s.target, has_plan, H, K, data, s, ws)
             worst, iterations = max(worst, level), iterations + count
             if level > RELAXED or take_step(ws.u, ws.x, s) < CONVERGED:
                 break

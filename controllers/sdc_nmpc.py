@@ -84,7 +84,8 @@ def _decide_rows(
     if bad >= 0:
         return bad
     pairs = N if relinearisations > 0 else 1
-    s = carve(buffer, N, pairs, data.normals.shape[0], data.normal.shape[0], 0)
+    H, K = data.normals.shape[0], data.normal.shape[0]
+    s = carve(buffer, N, pairs, H, K, 0)
     for j in range(plants.shape[0]):
         begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
         worst, iterations = 0, 0
@@ -94,8 +95,9 @@ def _decide_rows(
             if k > 0:
                 relinearise(ws.u, alpha, data, s)
                 stationary, pairs = False, N
+            has_plan = memories[j, 0] > 0.0
             level, count = solve_row(
-                s.A[:pairs], s.B[:pairs], data.Q, s.P, stationary, s.r, memories[j, 0] > 0.0, data, s, ws
+                s.A[:pairs], s.B[:pairs], data.Q, s.P, stationary, s.r, has_plan, H, K, data, s, ws
             )
             worst, iterations = max(worst, level), iterations + count
             if level > RELAXED:
