@@ -7,6 +7,8 @@ LLVM vectorises it. A result may be larger than needed: only its leading block i
 
 from __future__ import annotations
 
+import math
+
 from quad_envs._numba import kernel
 from quad_envs.parameters import Array
 
@@ -142,3 +144,74 @@ def lu_solve(A: Array, X: Array) -> None:
             factor = A[i, k]
             for j in range(m):
                 X[i, j] -= factor * X[k, j]
+
+
+@kernel
+def cholesky(A: Array) -> int:
+    """The lower factor L of A = L L' into the lower triangle of A (n, n); the rest of A is left alone.
+
+    Returns:
+        -1, or the first row whose pivot is not positive: A is not positive definite, or not finite there.
+    """
+    for i in range(A.shape[0]):
+        for j in range(i):
+            total = A[i, j]
+            for k in range(j):
+                total -= A[i, k] * A[j, k]
+            A[i, j] = total / A[j, j]
+        pivot = A[i, i]
+        for k in range(i):
+            pivot -= A[i, k] * A[i, k]
+        if not 0.0 < pivot < math.inf:  # false for NaN, too
+            return i
+        A[i, i] = math.sqrt(pivot)
+    return -1
+
+
+@kernel
+def solve_lower(L: Array, X: Array) -> None:
+    """Solve L Y = X in place for the lower triangle of L (n, n) and X (n, m)."""
+    for i in range(L.shape[0]):
+        for k in range(i):
+            factor = L[i, k]
+            for j in range(X.shape[1]):
+                X[i, j] -= factor * X[k, j]
+        inverse = 1.0 / L[i, i]
+        for j in range(X.shape[1]):
+            X[i, j] *= inverse
+
+
+@kernel
+def solve_lower_transposed(L: Array, X: Array) -> None:
+    """Solve L' Y = X in place for the lower triangle of L (n, n) and X (n, m)."""
+    for i in range(L.shape[0] - 1, -1, -1):
+        for k in range(i + 1, L.shape[0]):
+            factor = L[k, i]
+            for j in range(X.shape[1]):
+                X[i, j] -= factor * X[k, j]
+        inverse = 1.0 / L[i, i]
+        for j in range(X.shape[1]):
+            X[i, j] *= inverse
+
+
+@kernel
+def invert_spd(A: Array, inverse: Array) -> bool:
+    """The inverse of a symmetric positive definite A (n, n), for where the inverse itself is the result.
+
+    Args:
+        A: Overwritten by its factor.
+        inverse: Result, (n, n); untouched where A is not positive definite.
+
+    Returns:
+        Whether A is positive definite.
+    """
+    if cholesky(A) >= 0:
+        return False
+    n = A.shape[0]
+    for i in range(n):
+        for j in range(n):
+            inverse[i, j] = 1.0 if i == j else 0.0
+    solve_lower(A, inverse)
+    solve_lower_transposed(A, inverse)
+    symmetrise(inverse)
+    return True

@@ -1,0 +1,182 @@
+"""The target filter: an extended Kalman filter with constant velocity, section 6.2.1 of the dissertation.
+
+State x = [r_t; v_t] (6), m and m/s, inertial axes; the origin may be any point that moves without turning,
+such as the observing vehicle: `shift` follows it. One joint update takes all measurements of a step, made
+from any places and some time ago.
+
+Deviation: the dissertation's "constant velocity" filter has r_t alone for its state, squares the range and
+leaves R out of the gain (6.4). With two ranges the target can slide on a circle: there, and for some seconds
+after a third one returns, this filter, as any EKF, is too sure of itself.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quad_envs._numba import Int, kernel
+from quad_envs.parameters import Array
+from quad_envs.sensors import N_MEASUREMENT
+
+from .arguments import BoolArray, IntArray, as_floats, as_mask, require_non_negative
+from .ekf_kernels import N_TARGET, ekf_scratch, ekf_update_kernel, predict_kernel
+
+TARGET_POSITION = slice(0, 3)
+TARGET_VELOCITY = slice(3, 6)
+
+
+class TargetFilter(NamedTuple):
+    """What is believed of the target, one row per vehicle."""
+
+    x: Array  # (n, 6), r_t and v_t, m and m/s
+    P: Array  # (n, 6, 6)
+
+
+class Innovation(NamedTuple):
+    """How well the measurements of a step agree with the prediction, one row per vehicle."""
+
+    nis: Array  # (n,), nu' S^-1 nu, chi^2 with `rows` degrees of freedom; 0 without measurement
+    rows: IntArray  # (n,), rows used; an azimuth overhead is not among them
+    rejected: IntArray  # (n,), measurements left out: not finite, or S not positive definite
+
+
+def initial_filter(r: ArrayLike, v: ArrayLike, sigma: tuple[float, float]) -> TargetFilter:
+    """A filter that starts from a guess.
+
+    Args:
+        r: Guessed positions, (n, 3), m.
+        v: Guessed velocities, (n, 3) or (3,), m/s.
+        sigma: Standard deviations per axis of position, m, and velocity, m/s.
+
+    Raises:
+        ValueError: If a shape is wrong, a number is not finite, or a standard deviation not positive.
+    """
+    position = as_floats("r", r, (None, 3))
+    velocity = as_floats("v", np.broadcast_to(v, position.shape), position.shape)
+    if not (0.0 < sigma[0] < np.inf and 0.0 < sigma[1] < np.inf):
+        raise ValueError(f"sigma must be two finite numbers > 0 (m, m/s), got {sigma}")
+    variances = np.repeat(np.square(sigma), 3)
+    P = np.tile(np.diag(variances), (len(position), 1, 1))
+    return TargetFilter(np.concatenate([position, velocity], axis=1), P)
+
+
+def constant_velocity_model(dt: float, q: float) -> tuple[Array, Array]:
+    """Transition F and noise Q of a target with white acceleration, exactly discretised.
+
+    Args:
+        dt: Step, s.
+        q: Density of the acceleration, m^2/s^3, per axis.
+
+    Returns:
+        F (6, 6) and Q (6, 6).
+    """
+    F = np.kron(np.array([[1.0, dt], [0.0, 1.0]]), np.eye(3))
+    Q = q * np.kron(np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]]), np.eye(3))
+    return F, Q
+
+
+@kernel
+def _predict_rows(x: Array, P: Array, dt: float, q: float) -> None:
+    for i in range(x.shape[0]):
+        predict_kernel(x[i], P[i], dt, q)
+
+
+@kernel
+def _update_rows(
+    x: Array,
+    P: Array,
+    z: Array,
+    position: Array,
+    age: Array,
+    valid: BoolArray,
+    sigma: Array,
+    rows: Int,
+    nis: Array,
+    counts: IntArray,
+    scratch: Array,
+) -> None:
+    for i in range(x.shape[0]):
+        nis[i], counts[0, i], counts[1, i] = ekf_update_kernel(
+            x[i], P[i], z[i], position[i], age[i], valid[i], sigma, rows, scratch
+        )
+
+
+def _copied(state: TargetFilter) -> TargetFilter:
+    """Checked copies, which the kernels may change."""
+    x = as_floats("x", state.x, (None, N_TARGET)).copy()
+    return TargetFilter(x, as_floats("P", state.P, (len(x), N_TARGET, N_TARGET)).copy())
+
+
+def predict(state: TargetFilter, dt: float, q: float) -> TargetFilter:
+    """Predict: x <- F x, P <- F P F' + Q with the F and Q of `constant_velocity_model`.
+
+    Args:
+        state: n filters.
+        dt: Step, s.
+        q: Density of the target's acceleration, m^2/s^3: 0.02 for a target of constant velocity with small
+            disturbances, 0.4 for an aircraft that manoeuvres.
+
+    Raises:
+        ValueError: If a shape is wrong, a number is not finite, or dt or q is negative.
+    """
+    new = _copied(state)
+    _predict_rows(new.x, new.P, require_non_negative("dt", dt, "s"), require_non_negative("q", q, "m^2/s^3"))
+    return new
+
+
+def shift(state: TargetFilter, displacement: ArrayLike) -> TargetFilter:
+    """The same belief seen from an origin that moved by the displacement, (n, 3), m."""
+    new = _copied(state)
+    new.x[:, TARGET_POSITION] -= as_floats("displacement", displacement, (len(new.x), 3))
+    return new
+
+
+def update(
+    state: TargetFilter,
+    z: ArrayLike,
+    position: ArrayLike,
+    age: ArrayLike | None,
+    valid: ArrayLike | None,
+    sigma: ArrayLike,
+    rows: int,
+) -> tuple[TargetFilter, Innovation]:
+    """One joint update per vehicle with all measurements it holds.
+
+    The innovation of the azimuth is wrapped, and an azimuth straight overhead is left out. A measurement made
+    `age` ago is of the target at r - age v; the noise of the motion since then is neglected.
+
+    Args:
+        state: n predicted filters.
+        z: Range, azimuth, elevation, (n, m, 3), m, rad, rad; only the first `rows` are read.
+        position: Where each was made, (n, m, 3), m, in the frame of the state.
+        age: How long ago each was made, (n, m), s; None: now.
+        valid: Which are there, (n, m), bool; None: all. A vehicle without any keeps its prediction.
+        sigma: Standard deviations of z, (3,).
+        rows: 1 (range) or 3, see `quad_envs.sensors.sensor_rows`.
+
+    Returns:
+        The filters and their innovations. A measurement that is not finite, or that makes S indefinite, is
+        left out and counted as rejected.
+
+    Raises:
+        ValueError: If a shape is wrong, a state is not finite, sigma is not positive, or rows is neither 1
+            nor 3.
+    """
+    new = _copied(state)
+    n = len(new.x)
+    measured = as_floats("z", z, (n, None, N_MEASUREMENT), finite=False)
+    m = measured.shape[1]
+    places = as_floats("position", position, (n, m, 3), finite=False)
+    ages = np.zeros((n, m)) if age is None else as_floats("age", age, (n, m), finite=False)
+    noise = as_floats("sigma", sigma, (N_MEASUREMENT,))
+    if not (noise > 0.0).all():
+        raise ValueError(f"sigma must be three standard deviations > 0 (m, rad, rad), got {noise}")
+    if rows not in (1, N_MEASUREMENT):
+        raise ValueError(f"rows must be 1 (range) or {N_MEASUREMENT} (with both angles), got {rows!r}")
+    nis, counts = np.empty(n), np.empty((2, n), dtype=np.int64)
+    scratch = np.empty(ekf_scratch(m, rows))
+    mask = as_mask("valid", valid, (n, m))
+    _update_rows(new.x, new.P, measured, places, ages, mask, noise, rows, nis, counts, scratch)
+    return new, Innovation(nis, counts[0], counts[1])
