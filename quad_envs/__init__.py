@@ -9,11 +9,14 @@ from .registration import register
 
 if TYPE_CHECKING:
     from .disturbances import Gusts, Impulse, Steady, TorquePulse
+    from .formations import make_formation
+    from .graphs import Switching, Timed, adjacency, make_graph, toward_leader
     from .parameters import Limits, QuadrotorParams, Weights
     from .references import (
         Heading,
         Helix,
         Lemniscate,
+        Line,
         OutAndBack,
         Racetrack,
         RandomSmooth,
@@ -23,53 +26,90 @@ if TYPE_CHECKING:
         from_csv,
         from_function,
     )
+    from .targets import (
+        Aircraft,
+        ConstantVelocity,
+        PathTarget,
+        StaticTarget,
+        Target,
+        TurningTarget,
+        target_from_function,
+    )
     from .tasks import Task
 
 __version__ = "0.1.0"
 
 # Public name -> module; loaded at first use, so that importing the package stays cheap.
 _PUBLIC = {
+    "Aircraft": "targets",
+    "ConstantVelocity": "targets",
     "Gusts": "disturbances",
     "Heading": "references",
     "Helix": "references",
     "Impulse": "disturbances",
     "Lemniscate": "references",
     "Limits": "parameters",
+    "Line": "references",
     "OutAndBack": "references",
+    "PathTarget": "targets",
     "QuadrotorParams": "parameters",
     "Racetrack": "references",
     "RandomSmooth": "references",
     "Reference": "references",
     "SetPoint": "references",
     "SphericalSpiral": "references",
+    "StaticTarget": "targets",
     "Steady": "disturbances",
+    "Switching": "graphs",
+    "Target": "targets",
     "Task": "tasks",
+    "Timed": "graphs",
     "TorquePulse": "disturbances",
+    "TurningTarget": "targets",
     "Weights": "parameters",
+    "adjacency": "graphs",
     "from_csv": "references",
     "from_function": "references",
+    "make_formation": "formations",
+    "make_graph": "graphs",
+    "target_from_function": "targets",
+    "toward_leader": "graphs",
 }
 
 __all__ = [
+    "Aircraft",
+    "ConstantVelocity",
     "Gusts",
     "Heading",
     "Helix",
     "Impulse",
     "Lemniscate",
     "Limits",
+    "Line",
     "OutAndBack",
+    "PathTarget",
     "QuadrotorParams",
     "Racetrack",
     "RandomSmooth",
     "Reference",
     "SetPoint",
     "SphericalSpiral",
+    "StaticTarget",
     "Steady",
+    "Switching",
+    "Target",
     "Task",
+    "Timed",
     "TorquePulse",
+    "TurningTarget",
     "Weights",
+    "adjacency",
     "from_csv",
     "from_function",
+    "make_formation",
+    "make_graph",
+    "target_from_function",
+    "toward_leader",
 ]
 
 
