@@ -94,6 +94,8 @@ def _named_edges(name: str, formation: str | None, n: int) -> Edges:
                 f"the graph {name!r} belongs to the formations {', '.join(FORMATIONS)}; for other slots take "
                 f"{', '.join(GRAPHS[2:6])} or an ({n}, {n}) matrix"
             )
+        if formation == "hexagon" and n != 6:
+            raise ValueError(f"the graph {name!r} of a hexagon has 6 vehicles, got {n}: take 6 or 'lattice'")
         tree = _HEXAGON_WEAK if formation == "hexagon" else _lattice_tree(n)
         if name == "weak":
             return tree
@@ -102,8 +104,7 @@ def _named_edges(name: str, formation: str | None, n: int) -> Edges:
     if name == "chain":
         return [(a, a + 1) for a in everybody[:-1]]
     if name == "ring":
-        links = {(a, (a + 1) % n) for a in everybody if n > 1}
-        return links | {(b, a) for a, b in links}
+        return [(a, (a + step) % n) for a in everybody for step in (1, -1) if n > 1]
     if name == "star":
         return [(0, b) for b in everybody[1:]]
     if name == "complete":

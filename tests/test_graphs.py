@@ -199,6 +199,7 @@ def test_a_matrix_gives_weights_and_its_diagonal_is_not_read():
     [
         ("weak", None, 6, r"belongs to the formations triangle, hexagon, lattice; .* take chain, ring, star"),
         ("strong", "mine", 6, "belongs to the formations"),
+        ("weak", "hexagon", 7, "of a hexagon has 6 vehicles, got 7"),
         ("chian", None, 6, "did you mean 'chain'"),
         ("case-1", None, 5, "has 6 vehicles, got 5"),
         ("chapter-6", None, 6, "has 4 vehicles, got 6"),
