@@ -1,0 +1,466 @@
+"""MPC of a team: consensus, fusion with a target estimate, separation; Eqs. (5.4) to (5.8), (7.1), (7.2).
+
+Each row of a call is one vehicle, which decides from its own measurements and messages alone; a whole team is
+one compiled call. A vehicle flies SDC-NMPC in the heading frame (p = 0, psi = 0). Its state rows are those of
+the task's limits, then those of the vehicles it senses, slot by slot, so that leading parts go to the solver.
+
+Memory of one vehicle: whether a plan is held, the plan's rotor commands (N x 4), with `reject_disturbance`
+the estimator's numbers, then the planned positions and velocities (N x 6).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quad_envs._numba import kernel
+from quad_envs.agent_observations import N_PLAN_STAGE, N_SENSED
+from quad_envs.observations import N_REFERENCE
+from quad_envs.parameters import N_INPUT, N_STATE, Array
+from quad_envs.rotations import sincos
+from quad_envs.tasks import TeamTask
+
+from .collision import (
+    COLLISION_SCRATCH,
+    AvoidanceData,
+    AvoidanceOptions,
+    AvoidanceRule,
+    AvoidanceSet,
+    separation_rows,
+)
+from .consensus import (
+    CONSENSUS_SCRATCH,
+    ConsensusData,
+    ConsensusOptions,
+    Neighbour,
+    TargetModel,
+    consensus_row,
+    inertial_velocity,
+    require_messages,
+    turn_to_inertial,
+)
+from .controller import PLANT_SIZE, all_finite, as_array
+from .disturbance import ESTIMATOR_GAIN, ESTIMATOR_SIZE, N_DISTURBANCE
+from .fallback import HOVER, PREVIOUS_PLAN
+from .linalg import copy
+from .model import sdc_matrix, zero_order_hold
+from .mpc import MpcOptions, mpc_data, require_choice
+from .mpc_kernels import MpcData, Scratch, begin_row, buffer_size, carve, end_row, hold_trim, solve_row
+from .ocp import IntArray, OcpQp, StateRows, concatenate_rows
+from .solvers.structured import ITERATION_LIMIT, Workspace, make_workspace
+
+CooperativeTerminalWeight = Literal["hover", "stage"]
+Team = tuple[Array, ...]
+_NAMES = (
+    "plant", "last_command", "leader", "preview", "comm", "sensed", "estimate_r", "estimate_v", "estimate_P",
+    "slot", "disturbance", "memory",
+)  # fmt: skip
+_PLANT, _LAST, _LEADER, _PREVIEW, _COMM, _SENSED, _R, _V, _P, _SLOT, _DISTURBANCE, _MEMORY = range(12)
+
+
+class CooperativeDecision(NamedTuple):
+    """Commands for a team."""
+
+    command: Array  # (n, 4), rotor commands F_cmd, N, finite and inside the box
+    memory: Array  # (n, memory_size), opaque: pass it to the next decide
+    fallback: IntArray  # (n,), Fallback: how each command was found
+    iterations: IntArray  # (n,), active-set iterations
+    plan: Array  # (n, N, 6), p and v predicted for k+1..k+N, inertial, p relative to the present position
+    coincident: IntArray  # (n,), vehicles at the same place, from which no row can keep away
+
+
+class RowLayout(NamedTuple):
+    """What the kernels take besides the options of the parts."""
+
+    alpha: float
+    stage_weight: bool  # Q_f = Q
+    limits: int  # outputs with limits; the normals of the separation rows follow
+    limit_rows: int
+    slot_normals: int  # normals and rows of one vehicle to keep away from
+    slot_rows: int
+    message: int  # numbers in a comm slot
+    pairs: int  # (A, B), 1
+
+
+@kernel
+def level_weight(x_0: Array, P: Array, out: Array) -> None:
+    """T'P T with T = blkdiag(I, R', I, I), R = R_BI(phi, theta, 0): P compares velocities in the level frame.
+
+    Args:
+        x_0: State in the heading frame, (12,).
+        P: (12, 12), belongs to hover, where body and level axes are one.
+        out: Result, (12, 12).
+    """
+    sf, cf = sincos(x_0[6])
+    st, ct = sincos(x_0[7])
+    copy(P, out)
+    for k in range(N_STATE):
+        u, v, w = out[3, k], out[4, k], out[5, k]
+        down = st * u + ct * w
+        out[3, k], out[4, k], out[5, k] = ct * u - st * w, sf * down + cf * v, cf * down - sf * v
+    for k in range(N_STATE):
+        u, v, w = out[k, 3], out[k, 4], out[k, 5]
+        down = st * u + ct * w
+        out[k, 3], out[k, 4], out[k, 5] = ct * u - st * w, sf * down + cf * v, cf * down - sf * v
+
+
+@kernel
+def first_non_finite_row(team: Team) -> int:
+    """-1 if every number is finite, else len(team) row + index of the argument."""
+    for j in range(team[0].shape[0]):
+        for k in range(len(team)):
+            if not all_finite(team[k][j]):
+                return len(team) * j + k
+    return -1
+
+
+@kernel
+def _pose_row(
+    team: Team,
+    j: int,
+    which: IntArray | None,
+    consensus: ConsensusData,
+    avoidance: AvoidanceData,
+    layout: RowLayout,
+    data: MpcData,
+    s: Scratch,
+    work: Array,
+) -> tuple[int, int, int]:
+    """The problem of vehicle j into s; how many normals and rows count; how many vehicles coincide."""
+    N = s.c.shape[0]
+    plant, memory = team[_PLANT][j], team[_MEMORY][j]
+    window = work[: N_REFERENCE * (N + 1)].reshape(N + 1, N_REFERENCE)
+    attitude = work[window.size : window.size + 2 * (N + 1)].reshape(N + 1, 2)
+    free = work[window.size + attitude.size :]
+    preview = team[_PREVIEW][j].reshape(team[_PREVIEW].shape[1] // N_REFERENCE, N_REFERENCE)
+    comm = team[_COMM][j].reshape(team[_COMM].shape[1] // layout.message, layout.message)
+    sensed = team[_SENSED][j].reshape(team[_SENSED].shape[1] // N_SENSED, N_SENSED)
+    leads = team[_LEADER][j, 0] > 0.0
+    r, velocity, P, slot = team[_R][j], team[_V][j], team[_P][j], team[_SLOT][j]
+    consensus_row(plant, leads, preview, comm, r, velocity, P, slot, consensus, window, attitude, free)
+    for n in range(N + 1):
+        for a in range(3):
+            window[n, a] += plant[a]
+    begin_row(plant, window, team[_LAST][j], team[_DISTURBANCE][j], memory, which, data, s)
+    for n in range(N + 1):
+        for a in range(2):
+            s.r[n, 6 + a] += attitude[n, a]
+    sdc_matrix(s.x_0, layout.alpha, data.coefficients, s.A_c)
+    zero_order_hold(s.A_c, data.B_c, data.dt, s.A[0], s.B[0], s.square)
+    hold_trim(s.A, s.trim, s.c)
+    if layout.stage_weight:
+        copy(data.Q[0], s.P)
+    else:
+        level_weight(s.x_0, data.P, s.P)
+    plan = memory[memory.shape[0] - N_PLAN_STAGE * N :]
+    v, other, rest = free[:3], free[3:9], free[9:]
+    v[0], v[1], v[2] = inertial_velocity(plant)
+    used, coincident = separation_rows(
+        plant, v, comm, sensed, plan if memory[0] > 0.0 else plan[:0], N, avoidance,
+        s.normals[layout.limits :], s.row_lower[layout.limit_rows :], other, rest,
+    )  # fmt: skip
+    H, K = layout.limits + layout.slot_normals * used, layout.limit_rows + layout.slot_rows * used
+    return H, K, coincident
+
+
+@kernel
+def _write_plan(level: int, plant: Array, x: Array, old: Array, dt: float, plan: Array) -> None:
+    """Positions and velocities of the states x, or of the plan of the sample before, (6 N,); both flat.
+
+    The prediction turns velocities with the present attitude, as the model does.
+    """
+    N, m = x.shape[0] - 1, N_PLAN_STAGE
+    ss, cs = sincos(plant[8])
+    for i in range(N):
+        if level == HOVER:
+            for a in range(m):
+                plan[m * i + a] = 0.0
+        elif level == PREVIOUS_PLAN:
+            k = min(i + 1, N - 1)
+            for a in range(3):
+                plan[m * i + 3 + a] = old[m * k + 3 + a]
+                plan[m * i + a] = old[m * k + a] - old[a] + (i + 1 - k) * dt * old[m * k + 3 + a]
+        else:
+            X, Y = x[i + 1, 0], x[i + 1, 1]
+            plan[m * i], plan[m * i + 1], plan[m * i + 2] = cs * X - ss * Y, ss * X + cs * Y, x[i + 1, 2]
+            v = turn_to_inertial(x[i + 1, 3:6], plant)
+            plan[m * i + 3], plan[m * i + 4], plan[m * i + 5] = v
+
+
+@kernel
+def _decide_team(
+    team: Team,
+    commands: Array,
+    kept: Array,
+    report: IntArray,
+    which: IntArray | None,
+    consensus: ConsensusData,
+    avoidance: AvoidanceData,
+    layout: RowLayout,
+    data: MpcData,
+    buffer: Array,
+    work: Array,
+    ws: Workspace,
+) -> int:
+    """One decision per vehicle; -1, or the code of the first argument that is not finite."""
+    bad = first_non_finite_row(team)
+    if bad >= 0:
+        return bad
+    N = ws.u.shape[0]
+    s = carve(buffer, N, layout.pairs, data.normals.shape[0], data.normal.shape[0], 0)
+    for j in range(commands.shape[0]):
+        H, K, coincident = _pose_row(team, j, which, consensus, avoidance, layout, data, s, work)
+        plant, memory = team[_PLANT][j], team[_MEMORY][j]
+        level, iterations = solve_row(s.A, s.B, data.Q, s.P, False, s.r, memory[0] > 0.0, H, K, data, s, ws)
+        end_row(
+            level, plant, team[_LAST][j], team[_DISTURBANCE][j], memory, data, s, ws.u, commands[j], kept[j]
+        )
+        start = kept.shape[1] - N_PLAN_STAGE * N
+        _write_plan(level, plant, ws.x, memory[start:], data.dt, kept[j, start:])
+        report[0, j], report[1, j], report[2, j] = level, iterations, coincident
+    return bad
+
+
+class CooperativeMpc:
+    """Consensus, fusion, avoidance and SDC-NMPC of every vehicle of a team, chapters 5 and 7.
+
+    Not for use by several threads at once: the scratch memory is shared.
+
+    Deviation:
+        The terminal weight, of which chapter 5 says nothing, solves the Riccati equation of hover; with Q
+        itself ("stage") a formation never closes. It compares velocities in the level frame. alpha = 1 by
+        default, see `SdcNmpc`. `consensus.py` and `collision.py` name their own deviations.
+
+    Args:
+        task: What is known of the flight; its layout gives the number of slots and the length of messages.
+        horizon: N, samples.
+        alpha: Member of the family of factorisations, in [0, 1]; 1/2 is the dissertation's.
+        terminal_weight: "hover" or "stage".
+        neighbour: How neighbours move on over the horizon: "cv" (constant velocity), "frozen" (the
+            dissertation), "ca" (constant acceleration, from their attitude), "plan" (what they sent).
+        feed_forward: Whether the own term of the consensus moves on, too.
+        attitude: Whether tilt references come from the neighbours' accelerations; needs "ca", and a graph
+            without cycles among followers.
+        reach: Largest distance of a reference, m; inf for none. The dissertation has no such governor.
+        speed: Largest velocity reference, m/s; inf for none. Above the leader's speed.
+        formation_weight: P_f of (7.2), m^2.
+        target: Whether the target moves on over the horizon: "cv" or "frozen".
+        avoidance: "reciprocal", "frozen" (the dissertation's, its sign corrected), "plan" or "none".
+        avoidance_set: Whom to avoid, "sensed" or "edges".
+        moving_centre: Whether the common centre of a pair moves with it.
+        braking_time: t_b, s; 0 for no braking row.
+        swirl: Turn of the normals about the vertical, rad.
+        separation_weight: Exact penalty per metre of a separation row.
+        soft_weight: Exact penalty per unit of the other state rows; inf makes them hard.
+        margin: What the plan keeps from each limit of the task, in its SI unit.
+        reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
+        estimator_gain: Share of each new residual in the estimate, in (0, 1].
+        iteration_limit: Largest number of active-set steps of a solve.
+
+    Raises:
+        ValueError: If an option is not allowed.
+    """
+
+    def __init__(
+        self,
+        task: TeamTask,
+        horizon: int = 5,
+        alpha: float = 1.0,
+        terminal_weight: CooperativeTerminalWeight = "hover",
+        *,
+        neighbour: Neighbour = "cv",
+        feed_forward: bool = True,
+        attitude: bool = False,
+        reach: float = 1.0,
+        speed: float = 2.0,
+        formation_weight: float = 0.1,
+        target: TargetModel = "cv",
+        avoidance: AvoidanceRule = "reciprocal",
+        avoidance_set: AvoidanceSet = "sensed",
+        moving_centre: bool = True,
+        braking_time: float = 0.25,
+        swirl: float = math.radians(5.0),
+        separation_weight: float = 1e4,
+        soft_weight: float = 1e3,
+        margin: float = 0.02,
+        reject_disturbance: bool = False,
+        estimator_gain: float = ESTIMATOR_GAIN,
+        iteration_limit: int = ITERATION_LIMIT,
+    ) -> None:
+        if horizon != int(horizon) or horizon < 1:
+            raise ValueError(f"horizon must be a whole number of samples >= 1, got {horizon!r}")
+        if not 0.0 <= alpha <= 1.0:
+            raise ValueError(f"alpha must lie in [0, 1], got {alpha!r}; 1/2 is the dissertation's")
+        require_choice("terminal_weight", terminal_weight, CooperativeTerminalWeight)
+        self.task, self.horizon = task, int(horizon)
+        self.consensus = ConsensusOptions(
+            neighbour, feed_forward, attitude, reach, speed, formation_weight, target
+        )
+        self.avoidance = AvoidanceOptions(
+            avoidance, avoidance_set, moving_centre, braking_time, swirl, separation_weight
+        )
+        self.options = MpcOptions(
+            "structured", "heading", "attitude", soft_weight, margin, reject_disturbance, estimator_gain,
+            iteration_limit,
+        )  # fmt: skip
+        require_messages(task.layout.comm_size, self.consensus)
+        self._prepare(float(alpha), terminal_weight == "stage")
+        estimator = ESTIMATOR_SIZE if reject_disturbance else 0
+        self.memory_size = 1 + (N_INPUT + N_PLAN_STAGE) * self.horizon + estimator
+        self._workspace: tuple[Any, ...] | None = None
+
+    def _prepare(self, alpha: float, stage_weight: bool) -> None:
+        """Constants for the kernels: the rows of the limits, then those of every slot."""
+        task, edges = self.task, self.avoidance.neighbours == "edges"
+        data = mpc_data(task, self.horizon, self.options)
+        slots = task.layout.neighbours if edges else task.layout.sensed
+        limits = StateRows(data.normals, data.normal, data.stage, data.lower, data.upper, data.weight)
+        separation = self.avoidance.layout(slots, self.horizon)
+        rows = concatenate_rows(limits, separation)
+        axis = np.concatenate([data.axis, np.full(len(separation.normals), -1)])
+        self._data = data._replace(**rows._asdict(), axis=axis)
+        self._layout = RowLayout(
+            alpha, stage_weight, len(limits.normals), len(limits.normal),
+            len(separation.normals) // max(slots, 1), len(separation.normal) // max(slots, 1),
+            task.layout.comm_size, 1,
+        )  # fmt: skip
+        self._constants = (
+            self.consensus.data(task.dt, task.params.gravity),
+            self.avoidance.data(task.separation, task.sensing_radius, task.dt),
+            self._layout,
+            self._data,
+        )
+
+    def decide(
+        self,
+        plant: ArrayLike,
+        last_command: ArrayLike,
+        leader: ArrayLike,
+        preview: ArrayLike,
+        comm: ArrayLike,
+        sensed: ArrayLike,
+        estimate_r: ArrayLike | None,
+        estimate_v: ArrayLike | None,
+        estimate_P: ArrayLike | None,
+        slot: ArrayLike | None,
+        disturbance: ArrayLike,
+        memory: ArrayLike,
+    ) -> CooperativeDecision:
+        """One command per vehicle; rows are independent. Laid out as in `quad_envs.agent_observations`.
+
+        Args:
+            plant: Measured [p, V_B, Theta, Omega, F], (n, 16); p matters only where the task limits it.
+            last_command: Last applied rotor commands, (n, 4), N.
+            leader: Which vehicles follow their preview, (n,) bool.
+            preview: Leader's reference relative to its own position, (n, >= N+1, 8); not read of others.
+            comm: Messages, (n, K, 15 + 6 N_p).
+            sensed: Vehicles nearby, (n, K_s, 7).
+            estimate_r: Estimated target position less the own, (n, 3), m; None, as the next three, where
+                there is no target.
+            estimate_v: Estimated target velocity, (n, 3), m/s.
+            estimate_P: Covariance of the estimated position, (n, 3, 3), m^2.
+            slot: Wanted own position relative to the target, (n, 3), m.
+            disturbance: Torque in body axes, N m, and force in inertial axes, N, as far as revealed, (n, 6).
+            memory: Of the previous decision, (n, memory_size); zeros for a vehicle that starts.
+
+        Returns:
+            Commands, memory, how they were found, and the predictions.
+
+        Raises:
+            ValueError: If a shape is wrong or a number is not finite.
+        """
+        arguments = (
+            plant, last_command, leader, preview, comm, sensed, estimate_r, estimate_v, estimate_P, slot,
+            disturbance, memory,
+        )  # fmt: skip
+        team = self._as_team(arguments)
+        n, N = len(team[_PLANT]), self.horizon
+        command, kept = np.empty((n, N_INPUT)), np.empty((n, self.memory_size))
+        report = np.empty((3, n), np.int64)
+        which, *scratch = self._scratch()
+        bad = _decide_team(team, command, kept, report, which, *self._constants, *scratch)
+        if bad >= 0:
+            row, argument = divmod(bad, len(_NAMES))
+            remedy = "pass on what decide returned" if argument == _MEMORY else "check the observation"
+            raise ValueError(f"{_NAMES[argument]} of vehicle {row} is not finite; {remedy}")
+        plan = kept[:, -N_PLAN_STAGE * N :].reshape(n, N, N_PLAN_STAGE).copy()
+        return CooperativeDecision(command, kept, report[0], report[1], plan, report[2])
+
+    def problems(self, *arguments: ArrayLike | None) -> list[OcpQp]:
+        """The OCP-QP of each vehicle, in its heading frame; arguments as of `decide`. For study and tests."""
+        team, found = self._as_team(arguments), []
+        which, buffer, work, _ = self._scratch()
+        data, layout = self._data, self._layout
+        s = carve(buffer, self.horizon, layout.pairs, len(data.normals), len(data.normal), 0)
+        for j in range(len(team[_PLANT])):
+            H, K, _ = _pose_row(team, j, which, *self._constants, s, work)
+            rows = StateRows(
+                s.normals[:H].copy(),
+                data.normal[:K],
+                data.stage[:K],
+                s.row_lower[:K].copy(),
+                s.row_upper[:K].copy(),
+                s.weight[:K].copy(),
+            )
+            found.append(
+                OcpQp(
+                    s.A.copy(),
+                    s.B.copy(),
+                    s.c.copy(),
+                    data.Q,
+                    data.R,
+                    s.P.copy(),
+                    False,
+                    s.x_0.copy(),
+                    s.r.copy(),
+                    s.lower.copy(),
+                    s.upper.copy(),
+                    data.rate_step,
+                    s.u_last.copy(),
+                    rows,
+                )
+            )
+        return found
+
+    def _as_team(self, arguments: tuple[ArrayLike | None, ...]) -> Team:
+        """The arguments of `decide` as contiguous float64 arrays, (n, numbers), of the right shapes."""
+        empty = np.zeros((len(np.asarray(arguments[_PLANT])), 0))
+        arrays = [empty if value is None else as_array(value) for value in arguments]
+        n, layout = len(arrays[_PLANT]), self.task.layout
+        shapes: list[tuple[int, ...]] = [
+            (n, PLANT_SIZE), (n, N_INPUT), (n,), (n, layout.preview + 1, N_REFERENCE),
+            (n, layout.neighbours, layout.comm_size), (n, layout.sensed, N_SENSED),
+            (n, 3), (n, 3), (n, 3, 3), (n, 3), (n, N_DISTURBANCE), (n, self.memory_size),
+        ]  # fmt: skip
+        if all(arguments[k] is None for k in (_R, _V, _P, _SLOT)):
+            shapes[_R : _SLOT + 1] = [(n, 0)] * 4
+        for name, array, shape in zip(_NAMES, arrays, shapes, strict=True):
+            if array.shape != shape:
+                raise ValueError(
+                    f"{name} must have shape {shape} for this task and {n} vehicles, got {array.shape}"
+                )
+        if layout.preview < self.horizon and arrays[_LEADER].any():
+            raise ValueError(
+                f"a leader's preview must reach over the horizon {self.horizon}, got {layout.preview} stages; "
+                f"make the environment with preview={self.horizon} or shorten the horizon"
+            )
+        return tuple(array.reshape(n, math.prod(array.shape[1:])) for array in arrays)
+
+    def _scratch(self) -> tuple[Any, ...]:
+        """What the kernels take for the estimator, as buffer and work space, and for the solver."""
+        if self._workspace is None:
+            N, data = self.horizon, self._data
+            self._workspace = (
+                np.zeros(1, np.int64) if self.options.reject_disturbance else None,
+                np.zeros(buffer_size(N, 1, len(data.normals), len(data.normal), 0)),
+                np.zeros((N_REFERENCE + 2) * (N + 1) + max(CONSENSUS_SCRATCH, 9 + COLLISION_SCRATCH)),
+                make_workspace(N, len(data.normal), 1),
+            )
+        return self._workspace
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but scratch memory, which is made again when needed."""
+        return {**self.__dict__, "_workspace": None}
