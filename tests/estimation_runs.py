@@ -1,0 +1,124 @@
+"""Monte Carlo runs of chapter 6: four vehicles on rails, a target, and who holds whose measurements."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from controllers.estimation import ekf
+from controllers.estimation.consistency import nees
+from quad_envs.sensors import range_azimuth_elevation
+
+DT, STEPS = 0.05, 200
+SIGMA = np.array([0.1, 0.02, 0.02])  # m, rad, rad
+RAILS = np.array([[0.0, 0.0, 0.0], [4.0, 0.0, -1.0], [0.0, 4.0, 1.0], [4.0, 4.0, -2.0]])
+RAIL_VELOCITY = np.array([0.8, 0.3, -0.1])
+START = np.array([3.0, 3.0, -6.0, 0.8, 0.3, -0.1])
+INTERVALS = (slice(0, 50), slice(50, 100), slice(100, 200))  # 0 to 2.5, 2.5 to 5, 5 to 10 s
+# Topologies of figures 6.2 to 6.5, interval by interval: whose measurements vehicles 1 to 4 hold.
+HELD = (
+    ((0, 1, 2, 3), (0, 1, 2), (0, 1)),
+    ((1, 2), (1, 2, 3), (0, 1, 2, 3)),
+    ((0, 2, 3), (2, 3), (2, 3)),
+    ((2, 3), (2, 3), (1, 2, 3)),
+)
+
+
+class Truth(NamedTuple):
+    target: np.ndarray  # (steps, runs, 6)
+    vehicles: np.ndarray  # (steps, 4, 3)
+    z: np.ndarray  # (steps, runs, 4, 3)
+
+
+class Runs(NamedTuple):
+    x: np.ndarray  # (steps, runs, vehicles, 6)
+    P: np.ndarray  # (steps, runs, vehicles, 6, 6)
+    error: np.ndarray  # (steps, runs, vehicles, 3), position
+    nis: np.ndarray  # (steps, runs, vehicles)
+    rows: np.ndarray  # (steps, runs, vehicles)
+
+    def rmse(self, vehicle, interval):
+        return np.sqrt((self.error[interval, :, vehicle] ** 2).sum(axis=-1).mean())
+
+    def anees(self, vehicle, interval):
+        """Mean normalised error of the position over its 3 degrees of freedom; 1 for a consistent filter."""
+        return nees(self.error[interval, :, vehicle], self.P[interval, :, vehicle, :3, :3]).mean() / 3.0
+
+    def anis(self, vehicle, interval):
+        """Mean normalised innovation per row; 1 for a consistent filter."""
+        return self.nis[interval, :, vehicle].sum() / self.rows[interval, :, vehicle].sum()
+
+
+def measurements(target, rng):
+    """Vehicles on their rails and what they measure of the target (steps, runs, 6)."""
+    times = DT * np.arange(len(target))
+    vehicles = RAILS + times[:, None, None] * RAIL_VELOCITY
+    z = range_azimuth_elevation(target[:, :, None, :3] - vehicles[:, None])
+    return Truth(target, vehicles, z + SIGMA * rng.normal(size=z.shape))
+
+
+def cv_truth(runs, rng, q=0.02):
+    """The constant-velocity target of chapter 6."""
+    F, Q = ekf.constant_velocity_model(DT, q)
+    noise = np.linalg.cholesky(Q)
+    x, target = np.tile(START, (runs, 1)), np.empty((STEPS, runs, 6))
+    for k in range(STEPS):
+        x = x @ F.T + rng.normal(size=(runs, 6)) @ noise.T
+        target[k] = x
+    return measurements(target, rng)
+
+
+def aircraft_rate(t, X):
+    """Point-mass aircraft, Eq. (6.10) with z down, and its default manoeuvre."""
+    _, _, _, V, gamma, chi = X
+    V_c, a_v, a_h = 2.0 + 0.5 * np.sin(0.4 * t), 0.5 * np.cos(0.5 * t), np.sin(0.3 * t)
+    v = V * np.array([np.cos(chi) * np.cos(gamma), np.sin(chi) * np.cos(gamma), -np.sin(gamma)])
+    return [*v, V_c - V, a_v / V, a_h / (V * np.cos(gamma))]
+
+
+def aircraft_truth(runs, rng):
+    """The aircraft, measured in each run anew. Also its polar states, (steps, 6)."""
+    start = [6.0, -2.0, -5.0, 2.0, 0.05, 0.6]
+    times = DT * np.arange(1, STEPS + 1)
+    polar = solve_ivp(aircraft_rate, (0.0, times[-1]), start, t_eval=times, rtol=1e-9, atol=1e-9).y.T
+    velocity = np.array([aircraft_rate(t, X)[:3] for t, X in zip(times, polar, strict=True)])
+    target = np.concatenate([polar[:, :3], velocity], axis=1)
+    return measurements(np.tile(target[:, None], (1, runs, 1)), rng), polar
+
+
+def held(k, own_only=False):
+    """Whose measurements each vehicle holds in step k, (4, 4)."""
+    if own_only:
+        return np.eye(4, dtype=bool)
+    interval = next(i for i, part in enumerate(INTERVALS) if k < part.stop)
+    mask = np.zeros((4, 4), dtype=bool)
+    for i, rows in enumerate(HELD):
+        mask[i, list(rows[interval])] = True
+    return mask
+
+
+def start_filters(truth_0, P_0, rng):
+    """Filters of all vehicles in all runs, drawn from their own covariance: state (runs 4, 6)."""
+    runs = len(truth_0)
+    x = np.repeat(truth_0, 4, axis=0) + rng.normal(size=(4 * runs, 6)) @ np.linalg.cholesky(P_0).T
+    return ekf.TargetFilter(x, np.tile(P_0, (4 * runs, 1, 1)))
+
+
+def fly(truth, state, predict, rows, held=held, fuse=None, update=ekf.update):
+    """Run the filters over a truth; `fuse(state)` after each step, `held(k)` (4, 4)."""
+    runs = truth.z.shape[1]
+    parts = []
+    for k in range(len(truth.z)):
+        z = np.repeat(truth.z[k], 4, axis=0)
+        places = np.tile(truth.vehicles[k], (4 * runs, 1, 1))
+        valid = np.tile(held(k), (runs, 1))
+        state, innovation = update(predict(state), z, places, None, valid, SIGMA, rows)
+        state = fuse(state) if fuse else state
+        error = state.x[:, :3] - np.repeat(truth.target[k, :, :3], 4, axis=0)
+        parts.append((*state, error, innovation.nis, innovation.rows))
+    return Runs(
+        *(
+            np.array(part).reshape(len(parts), runs, 4, *part[0].shape[1:])
+            for part in zip(*parts, strict=True)
+        )
+    )
