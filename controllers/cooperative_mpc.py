@@ -16,49 +16,24 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quad_envs._numba import kernel
 from quad_envs.agent_observations import N_PLAN_STAGE, N_SENSED
 from quad_envs.observations import N_REFERENCE
-from quad_envs.parameters import N_INPUT, N_STATE, Array
-from quad_envs.rotations import sincos
+from quad_envs.parameters import N_INPUT, Array
 from quad_envs.tasks import TeamTask
 
-from .collision import (
-    COLLISION_SCRATCH,
-    AvoidanceData,
-    AvoidanceOptions,
-    AvoidanceRule,
-    AvoidanceSet,
-    separation_rows,
-)
-from .consensus import (
-    CONSENSUS_SCRATCH,
-    ConsensusData,
-    ConsensusOptions,
-    Neighbour,
-    TargetModel,
-    consensus_row,
-    inertial_velocity,
-    require_messages,
-    turn_to_inertial,
-)
-from .controller import PLANT_SIZE, all_finite, as_array
+from .collision import COLLISION_SCRATCH, AvoidanceOptions, AvoidanceRule, AvoidanceSet
+from .consensus import ConsensusOptions, Neighbour, TargetModel, require_messages
+from .consensus_kernels import CONSENSUS_SCRATCH
+from .controller import PLANT_SIZE, as_array
+from .cooperative_kernels import NAMES, RowLayout, Team, decide_team, pose_row
 from .disturbance import ESTIMATOR_GAIN, ESTIMATOR_SIZE, N_DISTURBANCE
-from .fallback import HOVER, PREVIOUS_PLAN
-from .linalg import copy
-from .model import sdc_matrix, zero_order_hold
 from .mpc import MpcOptions, mpc_data, require_choice
-from .mpc_kernels import MpcData, Scratch, begin_row, buffer_size, carve, end_row, hold_trim, solve_row
+from .mpc_kernels import buffer_size, carve
 from .ocp import IntArray, OcpQp, StateRows, concatenate_rows
-from .solvers.structured import ITERATION_LIMIT, Workspace, make_workspace
+from .solvers.structured import ITERATION_LIMIT, make_workspace
 
 CooperativeTerminalWeight = Literal["hover", "stage"]
-Team = tuple[Array, ...]
-_NAMES = (
-    "plant", "last_command", "leader", "preview", "comm", "sensed", "estimate_r", "estimate_v", "estimate_P",
-    "slot", "disturbance", "memory",
-)  # fmt: skip
-_PLANT, _LAST, _LEADER, _PREVIEW, _COMM, _SENSED, _R, _V, _P, _SLOT, _DISTURBANCE, _MEMORY = range(12)
+_TARGET = NAMES.index("estimate_r"), NAMES.index("slot") + 1
 
 
 class CooperativeDecision(NamedTuple):
@@ -70,158 +45,6 @@ class CooperativeDecision(NamedTuple):
     iterations: IntArray  # (n,), active-set iterations
     plan: Array  # (n, N, 6), p and v predicted for k+1..k+N, inertial, p relative to the present position
     coincident: IntArray  # (n,), vehicles at the same place, from which no row can keep away
-
-
-class RowLayout(NamedTuple):
-    """What the kernels take besides the options of the parts."""
-
-    alpha: float
-    stage_weight: bool  # Q_f = Q
-    limits: int  # outputs with limits; the normals of the separation rows follow
-    limit_rows: int
-    slot_normals: int  # normals and rows of one vehicle to keep away from
-    slot_rows: int
-    message: int  # numbers in a comm slot
-    pairs: int  # (A, B), 1
-
-
-@kernel
-def level_weight(x_0: Array, P: Array, out: Array) -> None:
-    """T'P T with T = blkdiag(I, R', I, I), R = R_BI(phi, theta, 0): P compares velocities in the level frame.
-
-    Args:
-        x_0: State in the heading frame, (12,).
-        P: (12, 12), belongs to hover, where body and level axes are one.
-        out: Result, (12, 12).
-    """
-    sf, cf = sincos(x_0[6])
-    st, ct = sincos(x_0[7])
-    copy(P, out)
-    for k in range(N_STATE):
-        u, v, w = out[3, k], out[4, k], out[5, k]
-        down = st * u + ct * w
-        out[3, k], out[4, k], out[5, k] = ct * u - st * w, sf * down + cf * v, cf * down - sf * v
-    for k in range(N_STATE):
-        u, v, w = out[k, 3], out[k, 4], out[k, 5]
-        down = st * u + ct * w
-        out[k, 3], out[k, 4], out[k, 5] = ct * u - st * w, sf * down + cf * v, cf * down - sf * v
-
-
-@kernel
-def first_non_finite_row(team: Team) -> int:
-    """-1 if every number is finite, else len(team) row + index of the argument."""
-    for j in range(team[0].shape[0]):
-        for k in range(len(team)):
-            if not all_finite(team[k][j]):
-                return len(team) * j + k
-    return -1
-
-
-@kernel
-def _pose_row(
-    team: Team,
-    j: int,
-    which: IntArray | None,
-    consensus: ConsensusData,
-    avoidance: AvoidanceData,
-    layout: RowLayout,
-    data: MpcData,
-    s: Scratch,
-    work: Array,
-) -> tuple[int, int, int]:
-    """The problem of vehicle j into s; how many normals and rows count; how many vehicles coincide."""
-    N = s.c.shape[0]
-    plant, memory = team[_PLANT][j], team[_MEMORY][j]
-    window = work[: N_REFERENCE * (N + 1)].reshape(N + 1, N_REFERENCE)
-    attitude = work[window.size : window.size + 2 * (N + 1)].reshape(N + 1, 2)
-    free = work[window.size + attitude.size :]
-    preview = team[_PREVIEW][j].reshape(team[_PREVIEW].shape[1] // N_REFERENCE, N_REFERENCE)
-    comm = team[_COMM][j].reshape(team[_COMM].shape[1] // layout.message, layout.message)
-    sensed = team[_SENSED][j].reshape(team[_SENSED].shape[1] // N_SENSED, N_SENSED)
-    leads = team[_LEADER][j, 0] > 0.0
-    r, velocity, P, slot = team[_R][j], team[_V][j], team[_P][j], team[_SLOT][j]
-    consensus_row(plant, leads, preview, comm, r, velocity, P, slot, consensus, window, attitude, free)
-    for n in range(N + 1):
-        for a in range(3):
-            window[n, a] += plant[a]
-    begin_row(plant, window, team[_LAST][j], team[_DISTURBANCE][j], memory, which, data, s)
-    for n in range(N + 1):
-        for a in range(2):
-            s.r[n, 6 + a] += attitude[n, a]
-    sdc_matrix(s.x_0, layout.alpha, data.coefficients, s.A_c)
-    zero_order_hold(s.A_c, data.B_c, data.dt, s.A[0], s.B[0], s.square)
-    hold_trim(s.A, s.trim, s.c)
-    if layout.stage_weight:
-        copy(data.Q[0], s.P)
-    else:
-        level_weight(s.x_0, data.P, s.P)
-    plan = memory[memory.shape[0] - N_PLAN_STAGE * N :]
-    v, other, rest = free[:3], free[3:9], free[9:]
-    v[0], v[1], v[2] = inertial_velocity(plant)
-    used, coincident = separation_rows(
-        plant, v, comm, sensed, plan if memory[0] > 0.0 else plan[:0], N, avoidance,
-        s.normals[layout.limits :], s.row_lower[layout.limit_rows :], other, rest,
-    )  # fmt: skip
-    H, K = layout.limits + layout.slot_normals * used, layout.limit_rows + layout.slot_rows * used
-    return H, K, coincident
-
-
-@kernel
-def _write_plan(level: int, plant: Array, x: Array, old: Array, dt: float, plan: Array) -> None:
-    """Positions and velocities of the states x, or of the plan of the sample before, (6 N,); both flat.
-
-    The prediction turns velocities with the present attitude, as the model does.
-    """
-    N, m = x.shape[0] - 1, N_PLAN_STAGE
-    ss, cs = sincos(plant[8])
-    for i in range(N):
-        if level == HOVER:
-            for a in range(m):
-                plan[m * i + a] = 0.0
-        elif level == PREVIOUS_PLAN:
-            k = min(i + 1, N - 1)
-            for a in range(3):
-                plan[m * i + 3 + a] = old[m * k + 3 + a]
-                plan[m * i + a] = old[m * k + a] - old[a] + (i + 1 - k) * dt * old[m * k + 3 + a]
-        else:
-            X, Y = x[i + 1, 0], x[i + 1, 1]
-            plan[m * i], plan[m * i + 1], plan[m * i + 2] = cs * X - ss * Y, ss * X + cs * Y, x[i + 1, 2]
-            v = turn_to_inertial(x[i + 1, 3:6], plant)
-            plan[m * i + 3], plan[m * i + 4], plan[m * i + 5] = v
-
-
-@kernel
-def _decide_team(
-    team: Team,
-    commands: Array,
-    kept: Array,
-    report: IntArray,
-    which: IntArray | None,
-    consensus: ConsensusData,
-    avoidance: AvoidanceData,
-    layout: RowLayout,
-    data: MpcData,
-    buffer: Array,
-    work: Array,
-    ws: Workspace,
-) -> int:
-    """One decision per vehicle; -1, or the code of the first argument that is not finite."""
-    bad = first_non_finite_row(team)
-    if bad >= 0:
-        return bad
-    N = ws.u.shape[0]
-    s = carve(buffer, N, layout.pairs, data.normals.shape[0], data.normal.shape[0], 0)
-    for j in range(commands.shape[0]):
-        H, K, coincident = _pose_row(team, j, which, consensus, avoidance, layout, data, s, work)
-        plant, memory = team[_PLANT][j], team[_MEMORY][j]
-        level, iterations = solve_row(s.A, s.B, data.Q, s.P, False, s.r, memory[0] > 0.0, H, K, data, s, ws)
-        end_row(
-            level, plant, team[_LAST][j], team[_DISTURBANCE][j], memory, data, s, ws.u, commands[j], kept[j]
-        )
-        start = kept.shape[1] - N_PLAN_STAGE * N
-        _write_plan(level, plant, ws.x, memory[start:], data.dt, kept[j, start:])
-        report[0, j], report[1, j], report[2, j] = level, iterations, coincident
-    return bad
 
 
 class CooperativeMpc:
@@ -377,15 +200,17 @@ class CooperativeMpc:
             disturbance, memory,
         )  # fmt: skip
         team = self._as_team(arguments)
-        n, N = len(team[_PLANT]), self.horizon
+        n, N = len(team[0]), self.horizon
         command, kept = np.empty((n, N_INPUT)), np.empty((n, self.memory_size))
         report = np.empty((3, n), np.int64)
         which, *scratch = self._scratch()
-        bad = _decide_team(team, command, kept, report, which, *self._constants, *scratch)
+        bad = decide_team(team, command, kept, report, which, *self._constants, *scratch)
         if bad >= 0:
-            row, argument = divmod(bad, len(_NAMES))
-            remedy = "pass on what decide returned" if argument == _MEMORY else "check the observation"
-            raise ValueError(f"{_NAMES[argument]} of vehicle {row} is not finite; {remedy}")
+            row, argument = divmod(bad, len(NAMES))
+            remedy = (
+                "pass on what decide returned" if NAMES[argument] == "memory" else "check the observation"
+            )
+            raise ValueError(f"{NAMES[argument]} of vehicle {row} is not finite; {remedy}")
         plan = kept[:, -N_PLAN_STAGE * N :].reshape(n, N, N_PLAN_STAGE).copy()
         return CooperativeDecision(command, kept, report[0], report[1], plan, report[2])
 
@@ -395,8 +220,8 @@ class CooperativeMpc:
         which, buffer, work, _ = self._scratch()
         data, layout = self._data, self._layout
         s = carve(buffer, self.horizon, layout.pairs, len(data.normals), len(data.normal), 0)
-        for j in range(len(team[_PLANT])):
-            H, K, _ = _pose_row(team, j, which, *self._constants, s, work)
+        for j in range(len(team[0])):
+            H, K, _ = pose_row(team, j, which, *self._constants, s, work)
             rows = StateRows(
                 s.normals[:H].copy(),
                 data.normal[:K],
@@ -427,24 +252,24 @@ class CooperativeMpc:
 
     def _as_team(self, arguments: tuple[ArrayLike | None, ...]) -> Team:
         """The arguments of `decide` as contiguous float64 arrays, (n, numbers), of the right shapes."""
-        empty = np.zeros((len(np.asarray(arguments[_PLANT])), 0))
+        empty = np.zeros((len(np.asarray(arguments[0])), 0))
         arrays = [empty if value is None else as_array(value) for value in arguments]
-        n, layout = len(arrays[_PLANT]), self.task.layout
+        n, layout = len(arrays[0]), self.task.layout
         shapes: list[tuple[int, ...]] = [
             (n, PLANT_SIZE), (n, N_INPUT), (n,), (n, layout.preview + 1, N_REFERENCE),
             (n, layout.neighbours, layout.comm_size), (n, layout.sensed, N_SENSED),
             (n, 3), (n, 3), (n, 3, 3), (n, 3), (n, N_DISTURBANCE), (n, self.memory_size),
         ]  # fmt: skip
-        if all(arguments[k] is None for k in (_R, _V, _P, _SLOT)):
-            shapes[_R : _SLOT + 1] = [(n, 0)] * 4
-        for name, array, shape in zip(_NAMES, arrays, shapes, strict=True):
+        if all(arguments[k] is None for k in range(*_TARGET)):
+            shapes[slice(*_TARGET)] = [(n, 0)] * 4
+        for name, array, shape in zip(NAMES, arrays, shapes, strict=True):
             if array.shape != shape:
                 raise ValueError(
                     f"{name} must have shape {shape} for this task and {n} vehicles, got {array.shape}"
                 )
-        if layout.preview < self.horizon and arrays[_LEADER].any():
+        if layout.preview < self.horizon and arrays[NAMES.index("leader")].any():
             raise ValueError(
-                f"a leader's preview must reach over the horizon {self.horizon}, got {layout.preview} stages; "
+                f"a leader's preview must reach over the horizon {self.horizon}, got {layout.preview}; "
                 f"make the environment with preview={self.horizon} or shorten the horizon"
             )
         return tuple(array.reshape(n, math.prod(array.shape[1:])) for array in arrays)

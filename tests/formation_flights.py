@@ -1,7 +1,8 @@
 """Closed loops of a team for the controller tests, with every observation made here from the true states.
 
 The rows are those of `quad_envs.agent_observations`: `messages` the comm slots (delay 0, a fixed slot per
-in-neighbour), `sensed_rows` the sensed slots (within the radius, most urgent first). No environment takes part.
+in-neighbour), `sensed_rows` the sensed slots (within the radius, most urgent first). No environment takes
+part.
 """
 
 from __future__ import annotations
@@ -12,54 +13,19 @@ import numpy as np
 
 from quad_envs.agent_observations import AgentLayout
 from quad_envs.dynamics import simulate
+from quad_envs.formations import make_formation, start_positions
+from quad_envs.graphs import make_graph, toward_leader
 from quad_envs.parameters import Limits
 from quad_envs.rotations import rotation_body_from_inertial
 from quad_envs.tasks import TeamTask
 
 DT = 0.05
 LIMITS = Limits(tilt=1.2)
-SINE = np.sqrt(0.75)
-TRIANGLE = np.array(
-    [[0, 0, 0], [-SINE, -0.5, 0], [-SINE, 0.5, 0], [-2 * SINE, -1, 0], [-2 * SINE, 0, 0], [-2 * SINE, 1, 0]]
-)
-_ANGLE = np.arange(6) * np.pi / 3
-HEXAGON = np.stack([np.cos(_ANGLE) - 1.0, np.sin(_ANGLE), np.zeros(6)], axis=-1)
-TRIANGLE_EDGES = [(0, 1), (0, 2), (1, 3), (2, 4), (2, 5)]  # (sender, receiver)
-HEXAGON_EDGES = [(0, 1), (0, 5), (1, 2), (5, 4), (2, 3)]
-LINE_START = np.array([[0.0, y, 0.0] for y in range(6)])
-SORTED_START = np.array([[0.0, y, 0.0] for y in (0, -1, 2, -2, 1, 3)])
-
-
-def graph(n, edges):
-    """G[i, j] = 1 where i hears j."""
-    G = np.eye(n)
-    for sender, receiver in edges:
-        G[receiver, sender] = 1.0
-    return G
-
-
-def strong(n, edges):
-    """All followers hear each other; the leader's links as given, weighted 10."""
-    G = np.ones((n, n))
-    G[0, 1:], G[1:, 0] = 0.0, 0.0
-    for sender, receiver in edges:
-        if sender == 0:
-            G[receiver, 0] = 10.0
-    return G
-
-
-def lattice(n):
-    """Slots and tree edges of the triangular lattice."""
-    slots, edges, row = [], [], 0
-    index = {}
-    while len(slots) < n:
-        for j in range(min(row + 1, n - len(slots))):
-            index[row, j] = len(slots)
-            slots.append([-row * SINE, j - row / 2, 0.0])
-            if row:
-                edges.append((index[row - 1, min(j, row - 1)], index[row, j]))
-        row += 1
-    return np.array(slots), edges
+RNG = np.random.default_rng(0)
+TRIANGLE, HEXAGON = make_formation("triangle", 6), make_formation("hexagon", 6)
+WEAK_TRIANGLE, WEAK_HEXAGON = make_graph("weak", "triangle", 6), make_graph("weak", "hexagon", 6)
+STRONG_TRIANGLE = toward_leader(make_graph("strong", "triangle", 6))
+LINE_START, SORTED_START = start_positions("line", TRIANGLE, RNG), start_positions("sorted", TRIANGLE, RNG)
 
 
 def still(t):
@@ -119,7 +85,7 @@ def messages(plants, G, slots, task, plans=None):
 
 
 def sensed_rows(plants, task):
-    """Sensed slots: within the radius, approaching ones by time to contact, then receding ones by distance."""
+    """Sensed slots: approaching vehicles by time to contact, then receding ones by distance."""
     n, K = len(plants), task.layout.sensed
     rows, v = np.zeros((n, K, 7)), velocities(plants)
     for i in range(n):
