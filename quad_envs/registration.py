@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium
+import pettingzoo
 
 _ENTRY = "quad_envs.envs.tracking:TrackingEnv"
 _VECTOR_ENTRY = "quad_envs.envs.tracking_vector:TrackingVectorEnv"
@@ -32,8 +33,16 @@ TRACKING: dict[str, dict[str, Any]] = {
 }
 
 
+# The multi-agent ids; the module has `parallel_env`, `env` and `vector_env`.
+TEAMS: dict[str, str] = {
+    "quad/Formation-v0": "quad_envs.formation_v0",
+    "quad/TargetTracking-v0": "quad_envs.target_tracking_v0",
+    "quad/CooperativeEstimation-v0": "quad_envs.cooperative_estimation_v0",
+}
+
+
 def register() -> None:
-    """Register every id with Gymnasium; calling it again changes nothing."""
+    """Register every id with Gymnasium or PettingZoo; calling it again changes nothing."""
     for env_id, defaults in TRACKING.items():
         if env_id not in gymnasium.registry:
             gymnasium.register(
@@ -42,3 +51,8 @@ def register() -> None:
                 vector_entry_point=_VECTOR_ENTRY,
                 kwargs={"env_id": env_id, **defaults},
             )
+    if hasattr(pettingzoo, "register"):  # from PettingZoo 1.27 on
+        for env_id, module in TEAMS.items():
+            if env_id not in pettingzoo.parallel_registry:
+                pettingzoo.register("parallel", env_id, f"{module}:parallel_env")
+                pettingzoo.register("aec", env_id, f"{module}:env")

@@ -64,6 +64,7 @@ class TeamTask(BaseTask):
     crash_distance: float = 0.33  # m, d_crash, tip to tip
     sensing_radius: float = 2.0  # m, R_s
     formation_weight: float = 1.0  # of the formation error in the stage cost
+    spanning_tree: bool = True  # whether news from the leader, or from who measures, can reach everybody
     sensor: str = ""  # of the target: "range" or "range-azimuth-elevation"; empty where there is none
     sensor_sigma: _Triple = (0.1, 0.02, 0.02)  # m, rad, rad: range, azimuth, elevation
     prior_velocity: _Triple = (0.0, 0.0, 0.0)  # m/s, of the target at the start; its position is p - slot

@@ -38,7 +38,7 @@ UPPER = slice(18, 21)
 WEIGHT_Q = slice(21, 33)
 WEIGHT_R = slice(33, 37)
 
-_BLOCK_FROM = 8  # rows from which a block of lanes is faster than one row at a time
+BLOCK_FROM = 8  # rows from which a block of lanes is faster than one row at a time
 
 
 def task_vector(task: Task | TeamTask, substeps: int, lost_distance: float) -> Array:
@@ -244,7 +244,7 @@ def step_rows(
                 return 4 * i + a
     substeps = int(task[SUBSTEPS])
     h = task[DT] / substeps
-    stride = np.int64(LANES) if n >= _BLOCK_FROM else np.int64(1)
+    stride = np.int64(LANES) if n >= BLOCK_FROM else np.int64(1)
     measured = scratch[scratch.size - 16 :]
     previous = scratch[scratch.size - 16 - 4 * LANES : scratch.size - 16].reshape(LANES, 4)
     for first in range(0, n, stride):

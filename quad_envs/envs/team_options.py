@@ -1,0 +1,316 @@
+"""Keyword arguments of the multi-agent environments, as validated values."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, get_args
+
+import numpy as np
+
+from ..agent_observations import AgentLayout
+from ..formations import FORMATIONS, make_formation, nearest_pair
+from ..graphs import (
+    GraphLike,
+    GraphSchedule,
+    GraphTable,
+    has_spanning_tree,
+    in_neighbours,
+    make_graph_table,
+    toward_leader,
+)
+from ..parameters import Array
+from ..references import Reference, make_reference
+from ..sensors import sensor_rows
+from ..targets import ConstantVelocity, Target, make_target
+from ..tasks import TeamTask
+from .vehicle_options import Triple, VehicleOptions, is_number, spread
+
+MOST_VEHICLES = 200
+FEW_VEHICLES = 6  # up to which everybody has a slot for everybody
+_SLOTS_OF_A_CROWD = 8
+CHAPTER_7_SLOTS = (
+    (-1.0, 0.0, -0.8),
+    (-1.0, 1.2, 0.4),
+    (-1.0, -1.2, 0.4),
+    (-2.2, 0.7, -0.3),
+    (-2.2, -0.7, -0.3),
+    (-2.2, 0.0, 0.8),
+)
+CHAPTER_6_RAILS = ((0.0, 0.0, 0.0), (4.0, 0.0, -1.0), (0.0, 4.0, 1.0), (4.0, 4.0, -2.0))
+CHAPTER_6_TARGET = ConstantVelocity(position=(3.0, 3.0, -6.0), velocity=(0.8, 0.3, -0.1), q=0.02)
+_STAGGER = 0.4  # m, up and down in turn: a plane of vehicles cannot tell the target from its mirror image
+_BEHIND = (-1.0, 0.0, 0.0)  # m, of a named formation relative to the target
+
+Comm = Literal["state", "plan"]
+Terminate = Literal["team", "agent"]
+_Rows = tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TeamOptions(VehicleOptions):
+    """What the multi-agent environments share. `FormationEnv` documents each field."""
+
+    mission: ClassVar[str] = ""
+    has_leader: ClassVar[bool] = False
+
+    tilt_limit: float = 1.2
+    time_limit: float = 20.0
+    max_cycles: int | None = None
+    vehicles: int = 6
+    formation: str | _Rows = "lattice"
+    spacing: float = 1.0
+    graph: str | GraphLike | GraphSchedule = "weak"
+    leader_weight: float = 10.0
+    drop_out: float = 0.0
+    delay: int = 0
+    message_lifetime: float = 2.0
+    comm: Comm = "state"
+    start: str | _Rows = "random"
+    separation: float = 0.4
+    crash_distance: float = 0.33
+    sensing_radius: float = 2.0
+    neighbours: int | None = None
+    sensed: int | None = None
+    preview: int = 5
+    terminate: Terminate = "team"
+    arena: float = 100.0
+    formation_weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.max_cycles is not None:
+            self.require_whole("max_cycles", 1)
+            object.__setattr__(self, "time_limit", self.max_cycles * self.dt)
+        VehicleOptions.__post_init__(self)
+        self.require_whole("vehicles", 2, MOST_VEHICLES)
+        self.require_whole("delay", 0)
+        self.require_whole("preview", 1 if self.comm == "plan" else 0)
+        for name in ("separation", "crash_distance", "sensing_radius", "arena"):
+            self.require_positive(name)
+        for name, kind in (("comm", Comm), ("terminate", Terminate)):
+            if getattr(self, name) not in get_args(kind):
+                allowed = " or ".join(map(repr, get_args(kind)))
+                raise ValueError(f"{name} must be {allowed}, got {getattr(self, name)!r}")
+        self._require_range("drop_out", 0.0, 1.0)
+        self._require_range("message_lifetime", self.delay * self.dt, math.inf)
+        self._require_range("leader_weight", 0.0, math.inf)
+        self._require_range("formation_weight", 0.0, math.inf)
+        if self.crash_distance >= self.separation:
+            raise ValueError(
+                f"crash_distance {self.crash_distance!r} m must be below the separation {self.separation!r} m"
+            )
+        self.make_task()
+
+    def _require_range(self, name: str, low: float, high: float) -> None:
+        value = getattr(self, name)
+        if not (is_number(value) and low <= value <= high):
+            raise ValueError(f"{name} must be a number from {low:g} to {high:g}, got {value!r}")
+
+    def make_slots(self) -> Array:
+        """Wanted positions p_i*, (N, 3), m, relative to the leader's or to the target."""
+        return make_formation(self.formation, self.vehicles, self.spacing, self.separation)
+
+    def make_graphs(self) -> GraphTable:
+        """The graphs of an episode; a link toward the leader weighs `leader_weight` where weights are 1."""
+        name = self.formation if isinstance(self.formation, str) and self.formation in FORMATIONS else None
+        table = make_graph_table(self.graph, name, self.vehicles, self.episode_steps, self.dt)
+        graphs = table.graphs
+        if self.has_leader and np.isin(graphs, (0.0, 1.0)).all():
+            graphs = np.where(graphs > 0.0, toward_leader(graphs.max(axis=0), self.leader_weight), 0.0)
+        return GraphTable(graphs, table.which)
+
+    def informed(self) -> list[int]:
+        """Vehicles that know where to go without hearing anybody."""
+        return [0]
+
+    def make_task(self) -> TeamTask:
+        """The value from which policies are built.
+
+        Raises:
+            ValueError: If a vehicle hears more neighbours than there are slots.
+        """
+        slots, graphs = self.make_slots(), self.make_graphs()
+        if len(slots) != self.vehicles:
+            raise ValueError(f"vehicles must be {len(slots)}, one per slot, got {self.vehicles!r}")
+        in_degree = in_neighbours(graphs.graphs).shape[1]
+        crowd = self.vehicles > FEW_VEHICLES
+        for name in ("neighbours", "sensed"):
+            if getattr(self, name) is not None:
+                self.require_whole(name, 1)
+        K = self.neighbours or (_SLOTS_OF_A_CROWD if crowd else FEW_VEHICLES - 1)
+        if in_degree > K:
+            raise ValueError(
+                f"a vehicle hears {in_degree} others in an episode, and its observation has {K} comm slots: "
+                f"pass neighbours={in_degree}, or a sparser graph"
+            )
+        spanned = self._spans(graphs)
+        if not spanned:
+            warnings.warn(
+                f"the union of the graphs {self.graph!r} has no spanning tree from "
+                f"{'the leader' if self.has_leader else 'the vehicles that measure'} to everybody: "
+                "who is not reached cannot follow",
+                stacklevel=2,
+            )
+        known = self.task_fields()
+        layout = AgentLayout(
+            preview=int(self.preview),
+            neighbours=int(K),
+            sensed=int(self.sensed or (_SLOTS_OF_A_CROWD if crowd else FEW_VEHICLES - 1)),
+            plan=int(self.preview) if self.comm == "plan" else 0,
+            position=known["limits"].has_position,
+            disturbance=self.reveal_disturbance,
+            target=not self.has_leader,
+        )
+        return TeamTask(
+            layout=layout,
+            mission=self.mission,
+            vehicles=int(self.vehicles),
+            separation=self.separation,
+            crash_distance=self.crash_distance,
+            sensing_radius=self.sensing_radius,
+            formation_weight=self.formation_weight,
+            spanning_tree=spanned,
+            **self._target_fields(),
+            **known,
+        )
+
+    def _target_fields(self) -> dict[str, Any]:
+        return {}
+
+    def _spans(self, graphs: GraphTable) -> bool:
+        """Whether news from an informed vehicle can reach everybody, in the union of all graphs."""
+        n = self.vehicles
+        union = np.eye(n + 1)
+        union[1:, 1:] = graphs.graphs.max(axis=0)
+        union[[1 + i for i in self.informed()], 0] = 1.0
+        return has_spanning_tree(union) and self.drop_out < 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FormationOptions(TeamOptions):
+    """What can be chosen about a formation flight. `FormationEnv` documents each field."""
+
+    kind: ClassVar[str] = "a formation"
+    mission: ClassVar[str] = "formation"
+    has_leader: ClassVar[bool] = True
+
+    env_id: str = "quad/Formation-v0"
+    reference: str | Reference = "line"
+
+    def __post_init__(self) -> None:
+        TeamOptions.__post_init__(self)
+        make_reference(self.reference)
+
+    def make_slots(self) -> Array:
+        """Wanted positions relative to the leader's, (N, 3), m."""
+        slots = TeamOptions.make_slots(self)
+        return np.asarray(slots - slots[0])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TargetTrackingOptions(TeamOptions):
+    """What can be chosen about target tracking. `TargetTrackingEnv` documents each field."""
+
+    kind: ClassVar[str] = "a target-tracking"
+    mission: ClassVar[str] = "target-tracking"
+
+    env_id: str = "quad/TargetTracking-v0"
+    formation: str | _Rows = "chapter-7"
+    graph: str | GraphLike | GraphSchedule = "ring"
+    target: str | Target | Reference = "cv"
+    target_spread: tuple[float, float] = (0.0, 0.0)
+    sensor: str = "range-azimuth-elevation"
+    sensor_sigma: Triple = (0.1, 0.02, 0.02)
+    detection: float = 1.0
+    measuring: str | tuple[int, ...] = "all"
+    prior_velocity: Triple = (0.0, 0.0, 0.0)
+    prior_sigma: tuple[float, float] = (3.0, 1.0)
+
+    def __post_init__(self) -> None:
+        self._require_range("detection", 0.0, 1.0)
+        for name, length in (
+            *(("sensor_sigma", 3), ("prior_velocity", 3), ("prior_sigma", 2), ("target_spread", 2)),
+        ):
+            values = spread(name, getattr(self, name), length)
+            if name != "prior_velocity" and min(values) < (0.0 if name == "target_spread" else 1e-9):
+                raise ValueError(f"{name} must be positive standard deviations, got {getattr(self, name)!r}")
+            object.__setattr__(self, name, values)
+        sensor_rows(self.sensor)
+        make_target(self.target)
+        TeamOptions.__post_init__(self)
+
+    def make_slots(self) -> Array:
+        """Wanted positions relative to the target, (N, 3), m."""
+        if isinstance(self.formation, str) and self.formation == "chapter-7":
+            if self.vehicles != len(CHAPTER_7_SLOTS):
+                raise ValueError(
+                    f"the formation 'chapter-7' has {len(CHAPTER_7_SLOTS)} slots, got vehicles="
+                    f"{self.vehicles!r}: choose 'lattice' or give (N, 3) offsets from the target"
+                )
+            return np.array(CHAPTER_7_SLOTS)
+        slots = TeamOptions.make_slots(self)
+        if isinstance(self.formation, str):
+            slots = slots + np.array(_BEHIND)
+            slots[:, 2] += _STAGGER * (-1.0) ** np.arange(self.vehicles)
+        return slots
+
+    def informed(self) -> list[int]:
+        """Vehicles that measure the target."""
+        if isinstance(self.measuring, str):
+            if self.measuring != "all":
+                raise ValueError(f"measuring must be 'all' or vehicle numbers, got {self.measuring!r}")
+            return list(range(self.vehicles))
+        for i in self.measuring:
+            if isinstance(i, bool) or not isinstance(i, int | np.integer) or not 0 <= i < self.vehicles:
+                raise ValueError(f"measuring names vehicle {i!r}; there are 0 .. {self.vehicles - 1}")
+        return [int(i) for i in self.measuring]
+
+    def _target_fields(self) -> dict[str, Any]:
+        return {
+            "sensor": self.sensor,
+            "sensor_sigma": self.sensor_sigma,
+            "prior_velocity": self.prior_velocity,
+            "prior_sigma": self.prior_sigma,
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EstimationOptions(TargetTrackingOptions):
+    """What can be chosen about cooperative estimation. `CooperativeEstimationEnv` documents each field."""
+
+    kind: ClassVar[str] = "a cooperative-estimation"
+    mission: ClassVar[str] = "estimation"
+
+    env_id: str = "quad/CooperativeEstimation-v0"
+    time_limit: float = 10.0
+    vehicles: int = 4
+    graph: str | GraphLike | GraphSchedule = "chapter-6"
+    rails: _Rows = CHAPTER_6_RAILS
+    rail_velocity: Triple = (0.8, 0.3, -0.1)
+    target: str | Target | Reference = CHAPTER_6_TARGET
+    target_spread: tuple[float, float] = (0.5, 0.5)
+    prior_velocity: Triple = (0.8, 0.3, -0.1)
+    prior_sigma: tuple[float, float] = (0.5, 0.5)
+
+    def __post_init__(self) -> None:
+        if self.comm == "plan":
+            raise ValueError("comm='plan' needs vehicles that fly; on rails choose comm='state'")
+        object.__setattr__(self, "rail_velocity", spread("rail_velocity", self.rail_velocity, 3))
+        TargetTrackingOptions.__post_init__(self)
+
+    def rail_positions(self) -> Array:
+        """Where the vehicles start, (N, 3), m."""
+        rails = np.asarray(self.rails, dtype=np.float64)
+        if rails.shape != (self.vehicles, 3) or not np.isfinite(rails).all():
+            raise ValueError(
+                f"rails must be {self.vehicles} positions (x, y, z), one per vehicle, got shape {rails.shape}"
+            )
+        if nearest_pair(rails)[2] == 0.0:
+            raise ValueError(f"rails of two vehicles coincide: {self.rails!r}; move one")
+        return rails
+
+    def make_slots(self) -> Array:
+        """First positions of the vehicles relative to where the target is expected, (N, 3), m."""
+        rows = make_target(self.target).rows(np.array([0.0, self.dt]), np.random.default_rng(0))
+        return np.asarray(self.rail_positions() - np.asarray(rows)[0, :3])

@@ -1,0 +1,169 @@
+"""Many teams at once: the batched form of the multi-agent environments, for training and sweeps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from ..parameters import Array
+from ..tasks import TeamTask
+from .exchange import ALIVE, HEARD, NEAREST, SLOT_ERROR, TERMS
+from .kernel import (
+    CLIPPED,
+    COST,
+    CRASHED,
+    EPISODE_COST,
+    PLANT,
+    REWARD,
+    STAGE_COST,
+    TRUNCATED,
+    VALUES,
+    VIOLATED,
+)
+from .team_batch import TeamBatch
+from .team_kernel import N_LOSS
+from .team_options import TeamOptions
+
+Observations = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+
+class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]):
+    """n teams stepped in one compiled call, equal agent by agent to n parallel environments.
+
+    Every agent is a row: vehicle i of team t is row t N + i, so that `num_envs` is n N and a policy that
+    treats rows alike is shared by all agents. A team begins anew in the step after its episode ended
+    (Gymnasium's NEXT_STEP), all of its rows at once; with `terminate="agent"` the rows of crashed vehicles
+    say terminated, and nothing counts there, until their team ends: `info["alive"]` tells which those are.
+
+    Args:
+        options: Of the task.
+        num_teams: Number of teams n.
+        autoreset_mode: NEXT_STEP (default) or DISABLED.
+
+    Raises:
+        ValueError: If num_teams < 1 or the mode is SAME_STEP.
+    """
+
+    def __init__(
+        self,
+        options: TeamOptions,
+        num_teams: int = 1,
+        *,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    ) -> None:
+        if isinstance(num_teams, bool) or not isinstance(num_teams, int | np.integer) or num_teams < 1:
+            raise ValueError(f"num_teams must be an integer >= 1, got {num_teams!r}")
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
+            raise ValueError("autoreset_mode must be NEXT_STEP or DISABLED for teams")
+        self._batch = TeamBatch(options, int(num_teams))
+        self.num_teams, self.num_envs = int(num_teams), int(num_teams) * options.vehicles
+        self.render_mode = None
+        self.metadata = {"render_modes": [], "render_fps": 20, "autoreset_mode": self.autoreset_mode}
+        size = self.task.layout.size
+        self.single_action_space = spaces.Box(-1.0, 1.0, (self.task.action_size,), np.float32)
+        self.single_observation_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self._generators: list[np.random.Generator] = []
+        self._done: Bools = np.zeros(self.num_teams, dtype=np.bool_)
+
+    @property
+    def task(self) -> TeamTask:
+        """What is known of the task before the flight."""
+        return self._batch.task
+
+    @property
+    def plants(self) -> Array:
+        """Copy of the plants [p, V_B, Theta, Omega, F], (n N, 16). For study and tests."""
+        return self._batch.rows[:, PLANT].copy()
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Begin an episode of every team; a seed s is s + t for team t.
+
+        Args:
+            seed: One number, one per team, or None to draw on.
+            options: As in the parallel environment, the same for all teams.
+        """
+        self._seed(seed)
+        observations = self._fresh_observations()
+        for t in range(self.num_teams):
+            self._reset_team(t, observations, options)
+        self._done[:] = False
+        return observations, self._info()
+
+    def step(self, actions: NDArray[np.float32]) -> tuple[Observations, Array, Bools, Bools, dict[str, Any]]:
+        """Hold the rotor commands of all vehicles over one control period."""
+        actions = np.ascontiguousarray(actions, dtype=np.float32)
+        if actions.shape != self.action_space.shape:
+            raise ValueError(f"actions must have shape {self.action_space.shape}, got {actions.shape}")
+        if not self._generators:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        anew = self._done if self.autoreset_mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._done)
+        begins = np.repeat(anew, self.task.vehicles)
+        if anew.any():
+            actions = np.where(begins[:, None], np.float32(0.0), actions)
+        observations = self._fresh_observations()
+        self._batch.step(actions, observations)
+        for t in np.flatnonzero(anew).tolist():
+            self._reset_team(t, observations, None)
+        rows = self._batch.rows
+        rewards = np.where(begins, 0.0, rows[:, REWARD])
+        terminated, truncated = rows[:, CRASHED] > 0.0, rows[:, TRUNCATED] > 0.0
+        truncated &= ~terminated
+        self._done = np.asarray((terminated | truncated).reshape(self.num_teams, -1).all(axis=1))
+        return observations, rewards, terminated, truncated, self._info()
+
+    def _reset_team(self, t: int, observations: Observations, options: dict[str, Any] | None) -> None:
+        n = self.task.vehicles
+        self._batch.reset_team(t, self._generators[t], observations[t * n : (t + 1) * n], options)
+
+    def _seed(self, seed: int | Sequence[int | None] | None) -> None:
+        if seed is None and self._generators:
+            return
+        if seed is None or isinstance(seed, int | np.integer):
+            seeds: Sequence[int | None] = [
+                None if seed is None else int(seed) + t for t in range(self.num_teams)
+            ]
+        else:
+            seeds = seed
+        if len(seeds) != self.num_teams:
+            raise ValueError(f"seed must be one number or {self.num_teams} of them, got {len(seeds)}")
+        fresh = [seeding.np_random(value)[0] for value in seeds]
+        keep = self._generators or fresh
+        self._generators = [
+            new if value is not None else old for value, new, old in zip(seeds, fresh, keep, strict=True)
+        ]
+
+    def _fresh_observations(self) -> Observations:
+        return np.empty((self.num_envs, self.task.layout.size), dtype=np.float32)
+
+    def _info(self) -> dict[str, Any]:
+        rows, n = self._batch.rows, len(self.task.constraint_names)
+        info: dict[str, Any] = {
+            "cost": rows[:, COST].copy(),
+            "episode_cost": rows[:, EPISODE_COST].copy(),
+            "constraint_violation": rows[:, VIOLATED] > 0.0,
+            "constraint_values": rows[:, VALUES : VALUES + n].copy(),
+            "stage_cost": rows[:, STAGE_COST].copy(),
+            "crashed": rows[:, CRASHED] > 0.0,
+            "clipped_actions": rows[:, CLIPPED].astype(np.int64),
+            "formation_error": rows[:, SLOT_ERROR].copy(),
+            "min_separation": rows[:, NEAREST].copy(),
+            "messages": rows[:, HEARD].astype(np.int64),
+            "reward_terms": rows[:, TERMS : TERMS + N_LOSS + n].copy(),
+            "alive": rows[:, ALIVE] > 0.0,
+        }
+        present = np.ones(self.num_envs, dtype=np.bool_)
+        return info | {f"_{key}": present.copy() for key in info}

@@ -1,0 +1,29 @@
+"""`quad/TargetTracking-v0` as a module, as PettingZoo's own environments have one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pettingzoo import AECEnv
+from pettingzoo.utils import parallel_to_aec
+
+from .envs.target_tracking import TargetTrackingEnv as raw_env
+from .envs.team_options import TargetTrackingOptions
+from .envs.team_vector import TeamVectorEnv
+
+__all__ = ["env", "parallel_env", "raw_env", "vector_env"]
+
+
+def parallel_env(**kwargs: Any) -> raw_env:
+    """The parallel environment; arguments as documented there."""
+    return raw_env(**kwargs)
+
+
+def env(**kwargs: Any) -> AECEnv[str, Any, Any]:
+    """The same, one agent after the other."""
+    return parallel_to_aec(parallel_env(**kwargs))
+
+
+def vector_env(num_teams: int = 1, *, autoreset_mode: str = "NextStep", **kwargs: Any) -> TeamVectorEnv:
+    """Many teams in one compiled call; every agent is a row."""
+    return TeamVectorEnv(TargetTrackingOptions.from_kwargs(kwargs), num_teams, autoreset_mode=autoreset_mode)
