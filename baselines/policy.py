@@ -18,6 +18,16 @@ Counts = NDArray[np.int64]
 N_FALLBACKS = 5  # members of controllers.fallback.Fallback
 
 
+class Estimates(NamedTuple):
+    """What a policy believes of the target, one row per vehicle."""
+
+    r: NDArray[np.float64]  # (n, 3), position relative to the own vehicle, m
+    v: NDArray[np.float64]  # (n, 3), m/s
+    P: NDArray[np.float64]  # (n, 6, 6), covariance of [r; v]
+    nis: NDArray[np.float64]  # (n,), normalised innovation squared of the last update; nan without one
+    rows: Counts  # (n,), numbers in the measurements of the last update; 0: none
+
+
 class PolicyState(NamedTuple):
     """What a policy carries from step to step, one row per vehicle. Callers pass it on, or read it."""
 
@@ -25,6 +35,7 @@ class PolicyState(NamedTuple):
     fallbacks: Counts  # (n, 5), how the commands of this episode were found, by controllers.fallback.Fallback
     iterations: Counts  # (n,), solver iterations of the last decision
     worst_iterations: Counts  # (n,), most iterations of a decision in this episode
+    estimates: Estimates | None = None  # of policies that estimate a target
 
 
 @runtime_checkable
