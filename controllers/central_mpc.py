@@ -219,7 +219,7 @@ class CentralMpc:
         return found
 
     def _normals(self, plants: Array, kept: Array) -> Array:
-        """a_ijn, (pairs, N, 3), along the difference of the previous plans; zero where they are at one place."""
+        """a_ijn, (pairs, N, 3), along the difference of the previous plans; zero where they coincide."""
         i, j = self._pairs.T
         n, N = len(plants), self.horizon
         p = np.repeat(plants[:, None, POSITION], N, axis=1)
