@@ -71,7 +71,7 @@ def is_overhead(dx: float, dy: float, dz: float, sigma_elevation: float) -> bool
     """Whether the target is so close to the vertical that the azimuth of a prediction d says nothing.
 
     There the azimuth turns by more within the uncertainty of d than its linearisation can follow. With the
-    factor 6 the largest normalised error of a pass at s = 0 falls from 38000 to 27; with 3 it is 353.
+    factor 6 the largest normalised error of a brisk pass at s = 0 falls from 38000 to 27; with 3 it is 353.
     """
     limit = OVERHEAD * sigma_elevation
     s2 = dx * dx + dy * dy

@@ -165,6 +165,18 @@ def test_a_fix_enters_the_filter_as_a_position():
     assert 0.8 < runs.anees(0, EARLY) < 1.2
 
 
+@pytest.mark.parametrize(("interval", "rmse", "consistency"), [(EARLY, 0.235, 1.01), (LATE, 0.311, 1.13)])
+def test_a_fix_alone_forgets_what_the_filter_knows(interval, rmse, consistency):
+    truth, _ = scenario()
+    steps, runs = truth.z[interval].shape[:2]
+    position = np.repeat(truth.vehicles[interval], runs, axis=0)
+    fix = trilaterate(position, truth.z[interval, ..., 0].reshape(-1, 4), SIGMA[0])
+    error = fix.r - truth.target[interval, :, :3].reshape(-1, 3)
+    good = fix.accepted
+    found = np.sqrt((error[good] ** 2).sum(-1).mean()), anees(error[good], fix.P[good])
+    np.testing.assert_allclose(found, [rmse, consistency], rtol=0.2)
+
+
 def squared_range(constant):
     """An update with z = rho^2: with its own noise and the bias removed, or with constant noise (6.3)."""
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from controllers.estimation.fusion import CI_WEIGHTS, covariance_intersection, fuse_point, fuse_reference
+from controllers.estimation.fusion import covariance_intersection, fuse_point, fuse_reference
+from controllers.estimation.fusion_kernels import CI_WEIGHTS
 from quad_envs._numba import kernel
 
 RNG = np.random.default_rng(0)

@@ -5,7 +5,8 @@ The filters are pure functions on small tuples, batched over vehicles; `ekf` and
 
 from . import consistency, ekf, polar_ekf
 from .ekf import Innovation, TargetFilter
-from .fusion import CI_WEIGHTS, Fused, covariance_intersection, fuse_reference
+from .fusion import Fused, covariance_intersection, fuse_reference
+from .fusion_kernels import CI_WEIGHTS
 from .kalman import KalmanUpdate, kalman_update
 from .trilateration import Fix, Reason, trilaterate
 

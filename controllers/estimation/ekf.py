@@ -6,7 +6,9 @@ from any places and some time ago.
 
 Deviation: the dissertation's "constant velocity" filter has r_t alone for its state, squares the range and
 leaves R out of the gain (6.4). With two ranges the target can slide on a circle: there, and for some seconds
-after a third one returns, this filter, as any EKF, is too sure of itself.
+after a third one returns, this filter, as any EKF, is too sure of itself. So it is where a vehicle alone has
+had the target straight overhead for seconds (passing at 0.2 m/s; not at 0.8 m/s): meanwhile, without azimuth,
+the direction in the horizontal plane is lost.
 """
 
 from __future__ import annotations
