@@ -168,7 +168,7 @@ def test_a_fix_enters_the_filter_as_a_position():
 @pytest.mark.parametrize(("interval", "rmse", "consistency"), [(EARLY, 0.235, 1.01), (LATE, 0.311, 1.13)])
 def test_a_fix_alone_forgets_what_the_filter_knows(interval, rmse, consistency):
     truth, _ = scenario()
-    steps, runs = truth.z[interval].shape[:2]
+    runs = truth.z.shape[1]
     position = np.repeat(truth.vehicles[interval], runs, axis=0)
     fix = trilaterate(position, truth.z[interval, ..., 0].reshape(-1, 4), SIGMA[0])
     error = fix.r - truth.target[interval, :, :3].reshape(-1, 3)

@@ -122,18 +122,8 @@ def trilaterate(
         np.empty((2, n)),
         np.empty(n, dtype=np.int64),
     )
-    _trilaterate_rows(
-        places,
-        ranges,
-        as_mask("valid", valid, (n, m)),
-        float(sigma),
-        guess,
-        float(max_ratio),
-        acceptance_limits(m, level),
-        r,
-        P,
-        numbers,
-        reason,
-        np.empty(m + TRILATERATION_SCRATCH),
-    )
+    mask, limits = as_mask("valid", valid, (n, m)), acceptance_limits(m, level)
+    scratch = np.empty(m + TRILATERATION_SCRATCH)
+    options = (float(sigma), guess, float(max_ratio), limits)
+    _trilaterate_rows(places, ranges, mask, *options, r, P, numbers, reason, scratch)
     return Fix(r, P, reason == Reason.ACCEPTED, numbers[0], numbers[1], reason)

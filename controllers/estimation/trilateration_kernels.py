@@ -148,6 +148,19 @@ def _no_fix(reason: int, r: Array, P: Array) -> tuple[int, float, float]:
 
 
 @kernel
+def _select(position: Array, distance: Array, valid: BoolArray, use: Array) -> int:
+    """Marks the ranges that count in use (m,), and returns how many do."""
+    count = 0
+    for j in range(use.shape[0]):
+        good = valid[j] and abs(distance[j]) < _LARGEST
+        for a in range(3):
+            good = good and abs(position[j, a]) < _LARGEST
+        use[j] = 1.0 if good else 0.0
+        count += 1 if good else 0
+    return count
+
+
+@kernel
 def trilaterate_kernel(
     position: Array,
     distance: Array,
@@ -181,13 +194,7 @@ def trilaterate_kernel(
     use, scratch = scratch[:m], scratch[m:]
     centre, trial, x = scratch[:3], scratch[3:6], scratch[6:9].reshape(3, 1)
     C, JJ = scratch[9:18].reshape(3, 3), scratch[18:27].reshape(3, 3)
-    count = 0
-    for j in range(m):
-        good = valid[j] and abs(distance[j]) < _LARGEST
-        for a in range(3):
-            good = good and abs(position[j, a]) < _LARGEST
-        use[j] = 1.0 if good else 0.0
-        count += 1 if good else 0
+    count = _select(position, distance, valid, use)
     if count < MIN_RANGES:
         return _no_fix(TOO_FEW, r, P)
     _spread(position, use, centre, C)
