@@ -113,8 +113,8 @@ def measure_target(
         team: Team vector.
         out: Result: valid, range, sin and cos of azimuth, elevation, (5,); zero where nothing is measured.
     """
-    for i in range(N_MEASURED):
-        out[i] = 0.0
+    for c in range(N_MEASURED):
+        out[c] = 0.0
     draw = draws[min(k, draws.shape[0] - 1), i]
     if measures > 0.0 and draw[3] < team[DETECTION]:
         rho, azimuth, elevation = measure(target[0] - own[0], target[1] - own[1], target[2] - own[2])

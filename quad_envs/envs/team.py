@@ -172,7 +172,7 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
             joined = np.concatenate(rows, dtype=np.float32, casting="same_kind")
         except (KeyError, TypeError, ValueError):
             joined = np.zeros(0, dtype=np.float32)
-        if len(actions) != len(agents) or joined.shape != (len(agents) * self._action_size,):
+        if not agents or len(actions) != len(agents) or joined.shape != (len(agents) * self._action_size,):
             self._check(actions)
         if len(agents) == len(self.possible_agents):
             return joined
