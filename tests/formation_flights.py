@@ -118,7 +118,7 @@ class TeamFlight(NamedTuple):
 def smallest_gap(plants):
     p = plants[:, :3]
     gap = np.linalg.norm(p[:, None] - p[None], axis=-1)
-    return gap[~np.eye(len(p), dtype=bool)].min()
+    return gap[~np.eye(len(p), dtype=bool)].min(initial=np.inf)
 
 
 def fly_team(controller, start, slots, G, path, seconds=20.0):
@@ -188,3 +188,24 @@ def swap_antipodes(controller, speed, vehicles=2, seed=0, jitter=0.05):
         plants = simulate(plants, last, task.params)
         gap, coincident = min(gap, smallest_gap(plants)), coincident + int(decision.coincident.sum())
     return Meeting(gap, np.linalg.norm(plants[:, :3] - goal, axis=1).max(), coincident)
+
+
+def decide(controller, plants, G, slots, memory=None, path=still, target=(None,) * 4, **changed):
+    """One decision of a team from its true states; `changed` replaces arguments by name."""
+    names = ("plant", "last_command", "leader", "preview", "comm", "sensed", "disturbance", "memory")
+    values = arguments(controller, plants, G, slots, memory, path)
+    named = {**dict(zip(names, values, strict=True)), **changed}
+    before, after = [named[name] for name in names[:6]], [named[name] for name in names[6:]]
+    return controller.decide(*before, *target, *after)
+
+
+def arguments(controller, plants, G, slots, memory=None, path=still):
+    """What `decide` takes, without the target estimate."""
+    task, n = controller.task, len(plants)
+    preview = np.zeros((n, task.layout.preview + 1, 8))
+    preview[0] = preview_rows(plants[0], path, 0, task.layout.preview + 1)
+    memory = np.zeros((n, controller.memory_size)) if memory is None else memory
+    return (
+        plants, np.full((n, 4), task.hover_force), np.arange(n) == 0, preview,
+        messages(plants, G, slots, task), sensed_rows(plants, task), np.zeros((n, 6)), memory,
+    )  # fmt: skip
