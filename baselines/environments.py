@@ -1,7 +1,8 @@
-"""From what a user has at hand, an id, an environment, a vector of them, to the environment and its Task."""
+"""From what a user has at hand, an id or an environment of whatever kind, to the environment and its task."""
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any
 
 import gymnasium
@@ -9,32 +10,42 @@ import numpy as np
 
 import quad_envs  # noqa: F401  registers the ids
 from quad_envs.names import unknown_name
-from quad_envs.registration import TRACKING
-from quad_envs.tasks import Task
+from quad_envs.registration import TEAMS, TRACKING
+from quad_envs.tasks import BaseTask
 
 
-def make_env(env_id: str, **kwargs: Any) -> gymnasium.Env[Any, Any]:
-    """`gymnasium.make` with an error that suggests the nearest id of this suite.
+def make_env(env_id: str, **kwargs: Any) -> Any:
+    """`gymnasium.make`, or the ParallelEnv of a multi-agent id; an unknown id gets the nearest one suggested.
 
     Raises:
         ValueError: If the id or an argument is unknown or not allowed.
     """
     name = env_id.removeprefix("quad_envs:")
+    if name in TEAMS:  # not through PettingZoo's registry, which it has from 1.27 on
+        try:
+            return import_module(TEAMS[name]).parallel_env(**kwargs)
+        except TypeError as error:
+            raise ValueError(str(error)) from error
     if name not in gymnasium.registry:
-        raise ValueError(unknown_name("environment id", env_id, TRACKING))
+        raise ValueError(unknown_name("environment id", env_id, [*TRACKING, *TEAMS]))
     try:
         return gymnasium.make(name, **kwargs)
     except TypeError as error:  # Gymnasium repeats all arguments behind the environment's own message
         raise ValueError(str(error.__cause__ or error)) from error
 
 
-def task_of(source: Any) -> Task:
-    """The Task of an environment (wrapped or not), a vector environment, an id or a Task.
+def is_parallel(env: Any) -> bool:
+    """Whether an environment is a PettingZoo ParallelEnv, wrapped or not."""
+    return hasattr(env, "possible_agents") and not hasattr(env, "agent_iter")
+
+
+def task_of(source: Any) -> BaseTask:
+    """The task of an environment (wrapped or not), a vector of them, a ParallelEnv, an id, or a task itself.
 
     Raises:
         ValueError: If there is none, or if a wrapper changed the observations or actions that it describes.
     """
-    if isinstance(source, Task):
+    if isinstance(source, BaseTask):
         return source
     if isinstance(source, str):
         env = make_env(source)
@@ -43,21 +54,26 @@ def task_of(source: Any) -> Task:
         finally:
             env.close()
     task = _find_task(source)
-    if not isinstance(task, Task):
+    if not isinstance(task, BaseTask):
         raise _no_task(source)
     _check_spaces(source, task)
     return task
 
 
 def require_own_task(env: Any) -> None:
-    """Check that an environment can be flown and measured: that it, and not a part of it, has the Task.
+    """Check that an environment can be flown and measured: that it, and not a part of it, has the task.
 
     Raises:
         ValueError: If not; it says what to use instead.
     """
-    if isinstance(getattr(getattr(env, "unwrapped", env), "task", None), Task):
+    if hasattr(env, "agent_iter"):
+        raise ValueError(
+            f"{env!r} moves one agent after the other; all have to decide at once: use parallel_env of its "
+            "module, or pettingzoo.make with the kind 'parallel'"
+        )
+    if isinstance(getattr(getattr(env, "unwrapped", env), "task", None), BaseTask):
         return
-    if isinstance(_find_task(env), Task):
+    if isinstance(_find_task(env), BaseTask):
         raise ValueError(
             f"a {type(env).__name__} hides the plants of its environments: use gymnasium.make_vec(..., "
             'vectorization_mode="vector_entry_point"), its default for the ids of this suite, or a single '
@@ -69,11 +85,13 @@ def require_own_task(env: Any) -> None:
 def _no_task(source: Any) -> ValueError:
     return ValueError(
         f"cannot find the task of {source!r}: give an environment of this suite (gymnasium.make, "
-        f"make_vec), one of the ids {', '.join(TRACKING)}, or a quad_envs.Task"
+        f"make_vec, pettingzoo.make), one of the ids {', '.join([*TRACKING, *TEAMS])}, or a quad_envs.Task"
     )
 
 
 def _find_task(source: Any) -> Any:
+    if is_parallel(source):  # a wrapper that adds to the observation brings a task that says so
+        return getattr(source, "task", None)
     task = getattr(getattr(source, "unwrapped", source), "task", None)
     if task is None and hasattr(source, "get_attr"):  # SyncVectorEnv, AsyncVectorEnv, and SB3's VecEnv
         try:
@@ -84,10 +102,18 @@ def _find_task(source: Any) -> Any:
     return task
 
 
-def _check_spaces(env: Any, task: Task) -> None:
-    """A policy reads the task's own layout and commands its own action box."""
+def _spaces(env: Any) -> tuple[Any, Any]:
+    """Observation and action space of one vehicle; None where there is none."""
+    if is_parallel(env):
+        first = env.possible_agents[0]
+        return env.observation_space(first), env.action_space(first)
     observations = getattr(env, "single_observation_space", getattr(env, "observation_space", None))
-    actions = getattr(env, "single_action_space", getattr(env, "action_space", None))
+    return observations, getattr(env, "single_action_space", getattr(env, "action_space", None))
+
+
+def _check_spaces(env: Any, task: Any) -> None:
+    """A policy reads the task's own layout and commands its own action box."""
+    observations, actions = _spaces(env)
     shape = getattr(observations, "shape", None)
     if shape is not None and shape[-1:] != (task.layout.size,):
         raise ValueError(
@@ -96,4 +122,4 @@ def _check_spaces(env: Any, task: Task) -> None:
         )
     low, high = getattr(actions, "low", None), getattr(actions, "high", None)
     if low is not None and high is not None and not (np.all(low == -1.0) and np.all(high == 1.0)):
-        raise ValueError(f"a wrapper changed the action box to {actions}; policies command Box(-1, 1, (4,))")
+        raise ValueError(f"a wrapper changed the action box to {actions}; policies command a Box(-1, 1)")

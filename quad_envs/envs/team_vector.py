@@ -87,6 +87,16 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
         """Copy of the plants [p, V_B, Theta, Omega, F], (n N, 16). For study and tests."""
         return self._batch.rows[:, PLANT].copy()
 
+    @property
+    def references(self) -> Array:
+        """Where each vehicle should be in its team's episode, (n N, T+1, 8). For study and tests."""
+        return np.concatenate([self._batch.wanted(t) for t in range(self.num_teams)])
+
+    @property
+    def targets(self) -> Array:
+        """Rows r, v of each team's target, (n, T+1, 6); zero where there is none. For study and tests."""
+        return np.stack([self._batch.target(t) for t in range(self.num_teams)])
+
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
