@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib import import_module
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_envs.names import unknown_name
+from quad_envs.tasks import BaseTask, Task, TeamTask
 
 Actions = NDArray[np.float32]
 Counts = NDArray[np.int64]
@@ -19,13 +20,27 @@ N_FALLBACKS = 5  # members of controllers.fallback.Fallback
 
 
 class Estimates(NamedTuple):
-    """What a policy believes of the target, one row per vehicle."""
+    """What a policy believes of the target, one row per vehicle.
+
+    Of an estimate from the estimate wrapper only the position's covariance is known: the rest of P is nan.
+    """
 
     r: NDArray[np.float64]  # (n, 3), position relative to the own vehicle, m
     v: NDArray[np.float64]  # (n, 3), m/s
     P: NDArray[np.float64]  # (n, 6, 6), covariance of [r; v]
     nis: NDArray[np.float64]  # (n,), normalised innovation squared of the last update; nan without one
     rows: Counts  # (n,), numbers in the measurements of the last update; 0: none
+    measurements: Counts | None = None  # (n,), measurements held at the last update
+    trilaterated: NDArray[np.bool_] | None = None  # (n,), whether they entered as a trilaterated position
+
+    @property
+    def modes(self) -> tuple[str, ...]:
+        """How each row was updated: "trilateration", or "EKF,m" with m measurements."""
+        held = self.rows if self.measurements is None else self.measurements
+        fixed = np.zeros(len(held), np.bool_) if self.trilaterated is None else self.trilaterated
+        return tuple(
+            "trilateration" if fix else f"EKF,{m}" for fix, m in zip(fixed, held.tolist(), strict=True)
+        )
 
 
 class PolicyState(NamedTuple):
@@ -62,7 +77,8 @@ class Policy(Protocol):
             deterministic: False lets a stochastic policy draw; the controllers ignore it.
 
         Returns:
-            Actions (n, 4) float32 in [-1, 1], or (4,) for an observation (d,), and the state to pass on.
+            Actions (n, a) float32 in [-1, 1], or (a,) for an observation (d,), and the state to pass on; a is
+            4 for one vehicle and `task.action_size` for a team.
         """
         ...
 
@@ -73,7 +89,12 @@ class PolicyEntry(NamedTuple):
     module: str
     factory: str  # name in the module: called with the task and the options
     description: str
+    missions: tuple[str, ...] = ("tracking",)  # that it serves, see `mission_of`
+    privileged: bool = False  # it sees `env.state()`: a yardstick, listed apart
 
+
+_FORMATION, _TARGET, _ESTIMATION = "formation", "target-tracking", "estimation"
+TEAM_MISSIONS = (_FORMATION, _TARGET, _ESTIMATION)
 
 # Names that `make_policy` knows for tracking tasks.
 TRACKING_POLICIES: dict[str, PolicyEntry] = {
@@ -89,11 +110,82 @@ TRACKING_POLICIES: dict[str, PolicyEntry] = {
     "random": PolicyEntry("baselines.tracking", "Random", "uniform random actions"),
 }
 
+# And for teams; "hover" and "random" serve both.
+TEAM_POLICIES: dict[str, PolicyEntry] = {
+    "consensus-mpc": PolicyEntry(
+        "baselines.cooperative",
+        "ConsensusMpc",
+        "consensus, collision avoidance and MPC of each vehicle (chapter 5)",
+        (_FORMATION,),
+    ),
+    "cooperative-mpc": PolicyEntry(
+        "baselines.cooperative",
+        "make_cooperative_mpc",
+        "the same beside a target that it estimates (chapter 7)",
+        (_TARGET, _ESTIMATION),
+    ),
+    "ekf": PolicyEntry(
+        "baselines.estimation",
+        "EkfPolicy",
+        "extended Kalman filter on the measurements held (chapter 6)",
+        (_ESTIMATION,),
+    ),
+    "trilateration": PolicyEntry(
+        "baselines.estimation",
+        "TrilaterationPolicy",
+        "trilateration where four ranges allow it, else the Kalman filter (chapter 6)",
+        (_ESTIMATION,),
+    ),
+    "central-mpc": PolicyEntry(
+        "baselines.central",
+        "CentralMpcPolicy",
+        "one MPC over the whole team, from the whole truth (8.2.3)",
+        (_FORMATION, _TARGET),
+        privileged=True,
+    ),
+    "hover": PolicyEntry(
+        "baselines.team_policies", "TeamHover", "hover thrust, whatever happens", TEAM_MISSIONS
+    ),
+    "random": PolicyEntry("baselines.team_policies", "TeamRandom", "uniform random actions", TEAM_MISSIONS),
+}
 
-def _factory(name: str) -> Callable[..., Any]:
-    if name not in TRACKING_POLICIES:
-        raise ValueError(unknown_name("policy", name, TRACKING_POLICIES))
-    entry = TRACKING_POLICIES[name]
+
+def mission_of(task: BaseTask) -> str:
+    """What policies of a task do: "tracking", "formation", "target-tracking" or "estimation"."""
+    return task.mission if isinstance(task, TeamTask) else "tracking"
+
+
+def serving(mission: str) -> dict[str, PolicyEntry]:
+    """The policies that serve a mission."""
+    table = TRACKING_POLICIES if mission == "tracking" else TEAM_POLICIES
+    return {name: entry for name, entry in table.items() if mission in entry.missions}
+
+
+def policy_entry(name: str, mission: str | None = None) -> PolicyEntry:
+    """The row of a policy in the registry.
+
+    Args:
+        name: Of the policy.
+        mission: That it has to serve; None: any.
+
+    Raises:
+        ValueError: If there is no such policy, or it serves other missions; it names those that serve.
+    """
+    known = TEAM_POLICIES | TRACKING_POLICIES
+    if name not in known:
+        raise ValueError(unknown_name("policy", name, known if mission is None else serving(mission)))
+    if mission is None:
+        return known[name]
+    able = serving(mission)
+    if name not in able:
+        serves = " and ".join(known[name].missions)
+        raise ValueError(
+            f"policy {name!r} is for {serves} tasks, not for {mission}; those that are: {', '.join(able)}"
+        )
+    return able[name]
+
+
+def _factory(entry: PolicyEntry) -> Callable[..., Any]:
     found: Callable[..., Any] = getattr(import_module(entry.module), entry.factory)
     return found
 
@@ -104,7 +196,8 @@ def policy_options(name: str) -> dict[str, Any]:
     Raises:
         ValueError: If the name is unknown.
     """
-    parameters = list(inspect.signature(_factory(name)).parameters.values())[1:]  # the first is the task
+    factory = _factory(policy_entry(name))
+    parameters = list(inspect.signature(factory).parameters.values())[1:]  # the first is the task
     return {parameter.name: parameter.default for parameter in parameters}
 
 
@@ -127,33 +220,53 @@ def make_policy(name: str, env: Any, **options: Any) -> Policy:
     """A policy for a task.
 
     Args:
-        name: One of TRACKING_POLICIES.
+        name: One of TRACKING_POLICIES, or for a team one of TEAM_POLICIES.
         env: An environment (wrapped or not), a vector environment, an id, or a Task. Only its Task is used.
         options: Of the policy, see `policy_options`; MPCs take `horizon`, `solver` and what their chapter
             offers. A horizon that is not given is 25, or the preview of the task where that is shorter.
             Feedback linearization uses the acceleration of the reference where there is a preview.
 
     Raises:
-        ValueError: If the name, an option or its value is not allowed, or the horizon exceeds the preview.
+        ValueError: If the name, an option or its value is not allowed, the policy is for other tasks, or the
+            horizon exceeds the preview.
     """
     from .environments import task_of
-    from .tracking import ControllerPolicy
 
-    factory, defaults = _factory(name), policy_options(name)
+    defaults = policy_options(name)
     for option in options:
         if option not in defaults:
             raise ValueError(unknown_name(f"option of policy {name!r}:", option, defaults))
         _check_kind(name, option, options[option], defaults[option])
-    task = task_of(env)
+    task: BaseTask = task_of(env)
+    factory = _factory(policy_entry(name, mission_of(task)))
+    if isinstance(task, TeamTask):
+        return _make_team_policy(name, factory, task, defaults, options)
+    return _make_tracking_policy(name, factory, cast(Task, task), defaults, options)
+
+
+def _built(name: str, factory: Callable[..., Any], task: BaseTask, options: Mapping[str, Any]) -> Any:
+    try:
+        return factory(task, **options)
+    except TypeError as error:
+        raise ValueError(f"policy {name!r} refused its options {dict(options)}: {error}") from error
+
+
+def _make_tracking_policy(
+    name: str,
+    factory: Callable[..., Any],
+    task: Task,
+    defaults: Mapping[str, Any],
+    options: dict[str, Any],
+) -> Policy:
+    """A controller behind the observations of one vehicle."""
+    from .tracking import ControllerPolicy
+
     preview = task.layout.preview
     if "horizon" in defaults:
         options.setdefault("horizon", min(defaults["horizon"], preview))
     if "acceleration_feed_forward" in defaults:
         options.setdefault("acceleration_feed_forward", defaults["acceleration_feed_forward"] and preview > 0)
-    try:
-        controller = factory(task, **options)
-    except TypeError as error:
-        raise ValueError(f"policy {name!r} refused its options {options}: {error}") from error
+    controller = _built(name, factory, task, options)
     if controller.horizon > preview:
         remedy = f"horizon <= {preview}" if "horizon" in defaults else "acceleration_feed_forward=False"
         raise ValueError(
@@ -161,3 +274,23 @@ def make_policy(name: str, env: Any, **options: Any) -> Policy:
             f"choose {remedy}, or gym.make({task.env_id!r}, preview={controller.horizon})"
         )
     return ControllerPolicy(controller, task, name)
+
+
+def _make_team_policy(
+    name: str,
+    factory: Callable[..., Any],
+    task: TeamTask,
+    defaults: Mapping[str, Any],
+    options: dict[str, Any],
+) -> Policy:
+    """A policy that reads the observations of agents; in a formation its leader needs the preview."""
+    preview = task.layout.preview
+    if "horizon" in defaults and task.mission == _FORMATION:
+        horizon = options.setdefault("horizon", max(1, min(defaults["horizon"], preview)))
+        if horizon > preview:
+            raise ValueError(
+                f"policy {name!r} looks {horizon} steps ahead, the leader sees {preview}: choose horizon <= "
+                f"{preview}, or make {task.env_id!r} with preview={horizon}"
+            )
+    policy: Policy = _built(name, factory, task, options)
+    return policy

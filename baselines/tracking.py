@@ -16,6 +16,7 @@ from quad_envs.parameters import Array
 from quad_envs.tasks import Task
 
 from .policy import N_FALLBACKS, Actions, Counts, PolicyState
+from .rows import as_rows, as_starts, not_finite, state_of
 
 _PLANT_SIZE, _N_DISTURBANCE = 16, 6
 
@@ -83,7 +84,7 @@ def _decode(
 
 
 @kernel
-def _encode(
+def encode_commands(
     commands: Array,
     fallback: Counts,
     iterations: Counts,
@@ -151,29 +152,20 @@ class ControllerPolicy:
         Raises:
             ValueError: If a shape is wrong or an observation is not finite; it names the part.
         """
-        obs = np.ascontiguousarray(observation, dtype=np.float32)
-        one = obs.ndim == 1
-        if one:
-            obs = obs.reshape(1, -1)
+        obs, one = as_rows(observation, self._size)
         n = obs.shape[0]
-        if obs.ndim != 2 or obs.shape[1] != self._size:
-            shape = np.shape(observation)
-            raise ValueError(f"observation must have shape (n, {self._size}) or ({self._size},), got {shape}")
-        start = self._starts(episode_start, n)
-        if state is None:
-            state = self._fresh(n)
-        elif state.worst_iterations.shape[0] != n:
-            raise ValueError(f"state has {state.worst_iterations.shape[0]} rows, the observation {n}")
+        start = as_starts(episode_start, n)
+        state = state_of(state, n, self.controller.memory_size)
         plants, lasts = np.empty((n, _PLANT_SIZE)), np.empty((n, 4))
         windows, disturbances = np.empty((n, self._stages, N_REFERENCE)), np.empty((n, _N_DISTURBANCE))
         code = _decode(obs, start, *self._sees, plants, windows, lasts, disturbances)
         if code >= 0:
-            raise self._not_finite(obs, code)
+            raise not_finite(obs, code, self.task.layout.slices)
         memory = state.memory if code == -1 else np.where(start[:, None], 0.0, state.memory)
         decision = self.controller.decide(plants, windows, lasts, disturbances, memory)
         actions = np.empty((n, 4), dtype=np.float32)
         counts, worst = np.empty((n, N_FALLBACKS), dtype=np.int64), np.empty(n, dtype=np.int64)
-        _encode(
+        encode_commands(
             decision.command,
             decision.fallback,
             decision.iterations,
@@ -188,32 +180,6 @@ class ControllerPolicy:
         )
         kept = PolicyState(decision.memory, counts, decision.iterations, worst)
         return actions[0] if one else actions, kept
-
-    def _fresh(self, n: int) -> PolicyState:
-        """The state before an episode."""
-        count = np.zeros(n, dtype=np.int64)
-        memory = np.zeros((n, self.controller.memory_size))
-        return PolicyState(memory, np.zeros((n, N_FALLBACKS), dtype=np.int64), count, count)
-
-    @staticmethod
-    def _starts(episode_start: ArrayLike | None, n: int) -> NDArray[np.bool_]:
-        if episode_start is None:
-            return np.zeros(n, dtype=np.bool_)
-        start = np.ascontiguousarray(episode_start, dtype=np.bool_)
-        if start.shape != (n,):
-            raise ValueError(f"episode_start must have shape ({n},), one flag per row, got {start.shape}")
-        return start
-
-    def _not_finite(self, obs: Actions, index: int) -> ValueError:
-        """The error for an observation with NaN or infinity at a flat index."""
-        row, column = divmod(index, self._size)
-        slices = {name: part for name, part in self.task.layout.slices.items() if name != "own"}
-        name = next(name for name, part in slices.items() if part.start <= column < part.stop)
-        where = f"entry {column - slices[name].start} of {name!r}"
-        return ValueError(
-            f"observation {row} is not finite: {where} (index {column}) is {obs[row, column]}; "
-            "check the sensors or the wrapper that made it"
-        )
 
 
 class Hover:

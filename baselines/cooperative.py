@@ -1,0 +1,303 @@
+"""The cooperative MPC of chapters 5 and 7 as policies: each agent decides from its own row alone."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from controllers.collision import AvoidanceRule, AvoidanceSet
+from controllers.consensus import Neighbour, TargetModel
+from controllers.cooperative_mpc import CooperativeDecision, CooperativeMpc, CooperativeTerminalWeight
+from controllers.disturbance import ESTIMATOR_GAIN
+from controllers.solvers.structured import ITERATION_LIMIT
+from quad_envs.agent_observations import N_SENSED
+from quad_envs.names import unknown_name
+from quad_envs.observations import N_REFERENCE
+from quad_envs.parameters import Array
+from quad_envs.tasks import TeamTask
+
+from .cooperative_decoding import (
+    Decoded,
+    decode_rows,
+    empty_parts,
+    encode_decisions,
+    part_starts,
+    split_memory,
+)
+from .estimation import EstimatorPolicy, SharedEstimatePolicy, TargetEstimator, shared_estimates
+from .estimation_kernels import FILTER_SIZE
+from .policy import N_FALLBACKS, Actions, Counts, Estimates, PolicyState
+from .rows import not_finite
+from .team_policies import Flags, TeamPolicy
+
+EstimateSource = Literal["own", "shared"]
+
+
+class CooperativePolicy(TeamPolicy):
+    """A `CooperativeMpc` between observations and actions.
+
+    The memory of an agent is the controller's, then that of its filter where there is one.
+
+    Args:
+        controller: Of the team.
+        name: For tables and messages.
+        filter_size: Numbers of a filter in the memory.
+    """
+
+    def __init__(self, controller: CooperativeMpc, name: str, filter_size: int) -> None:
+        super().__init__(controller.task, name, controller.memory_size + filter_size)
+        self.controller, self._filter_size = controller, filter_size
+        self._starts = part_starts(self.task.layout)
+
+    def _decode(self, obs: Actions, memory: Array, start: Flags) -> tuple[Decoded, Array]:
+        """The parts of the rows, and the controller's memory."""
+        parts, kept = empty_parts(self.task.layout, len(obs)), np.empty((len(obs), memory.shape[1]))
+        code = decode_rows(obs, self._starts, *parts)
+        if code >= 0:
+            raise not_finite(obs, code, self.task.layout.slices)
+        split_memory(memory, start, kept, np.empty((len(obs), 0)))
+        return parts, kept
+
+    def _control(self, parts: Decoded, estimates: Estimates | None, memory: Array) -> CooperativeDecision:
+        """The controller's decision."""
+        n, layout = len(parts.plant), self.task.layout
+        target: tuple[Array | None, ...] = (None, None, None, None)
+        if estimates is not None:
+            target = estimates.r, estimates.v, estimates.P[:, :3, :3], parts.slot
+        return self.controller.decide(
+            parts.plant,
+            parts.last_command,
+            parts.leader[:, 0],
+            parts.preview.reshape(n, layout.preview + 1, N_REFERENCE),
+            parts.comm.reshape(n, layout.neighbours, layout.comm_size),
+            parts.sensed.reshape(n, layout.sensed, N_SENSED),
+            *target,
+            parts.disturbance,
+            memory,
+        )
+
+    def _act(
+        self,
+        decision: CooperativeDecision,
+        filters: Array,
+        estimates: Estimates | None,
+        state: PolicyState,
+        start: Flags,
+    ) -> tuple[Actions, PolicyState]:
+        """The decision as actions, and the state to pass on."""
+        n, task = len(start), self.task
+        actions = np.empty((n, task.action_size), dtype=np.float32)
+        counts: Counts = np.empty((n, N_FALLBACKS), dtype=np.int64)
+        worst, memory = np.empty(n, dtype=np.int64), np.empty((n, self.memory_size))
+        encode_decisions(
+            decision.command,
+            decision.plan.reshape(n, -1),
+            decision.fallback,
+            decision.iterations,
+            start,
+            state.fallbacks,
+            state.worst_iterations,
+            float(task.hover_force),
+            float(task.force_max),
+            float(task.dt),
+            decision.memory,
+            filters,
+            actions,
+            counts,
+            worst,
+            memory,
+        )
+        return actions, PolicyState(memory, counts, decision.iterations, worst, estimates)
+
+
+class ConsensusMpc(CooperativePolicy):
+    """Consensus, collision avoidance and MPC of each vehicle, chapter 5.
+
+    Args:
+        task: Of the mission "formation".
+        horizon: See `controllers.cooperative_mpc.CooperativeMpc`, as all others.
+        alpha: See there.
+        terminal_weight: See there.
+        neighbour: See there.
+        feed_forward: See there.
+        attitude: See there.
+        reach: See there.
+        speed: See there.
+        avoidance: See there.
+        avoidance_set: See there.
+        moving_centre: See there.
+        braking_time: See there.
+        swirl: See there.
+        separation_weight: See there.
+        soft_weight: See there.
+        margin: See there.
+        reject_disturbance: See there.
+        estimator_gain: See there.
+        iteration_limit: See there.
+
+    Raises:
+        ValueError: If the task has a target, or an option is not allowed.
+    """
+
+    def __init__(
+        self,
+        task: TeamTask,
+        horizon: int = 5,
+        alpha: float = 1.0,
+        terminal_weight: CooperativeTerminalWeight = "hover",
+        *,
+        neighbour: Neighbour = "cv",
+        feed_forward: bool = True,
+        attitude: bool = False,
+        reach: float = 1.0,
+        speed: float = 2.0,
+        avoidance: AvoidanceRule = "reciprocal",
+        avoidance_set: AvoidanceSet = "sensed",
+        moving_centre: bool = True,
+        braking_time: float = 0.25,
+        swirl: float = math.radians(5.0),
+        separation_weight: float = 1e4,
+        soft_weight: float = 1e3,
+        margin: float = 0.02,
+        reject_disturbance: bool = False,
+        estimator_gain: float = ESTIMATOR_GAIN,
+        iteration_limit: int = ITERATION_LIMIT,
+    ) -> None:
+        if task.layout.target:
+            raise ValueError(
+                f"consensus-mpc has no answer to the target of {task.env_id!r}: take cooperative-mpc"
+            )
+        controller = CooperativeMpc(
+            task, horizon, alpha, terminal_weight, neighbour=neighbour, feed_forward=feed_forward,
+            attitude=attitude, reach=reach, speed=speed, avoidance=avoidance, avoidance_set=avoidance_set,
+            moving_centre=moving_centre, braking_time=braking_time, swirl=swirl,
+            separation_weight=separation_weight, soft_weight=soft_weight, margin=margin,
+            reject_disturbance=reject_disturbance, estimator_gain=estimator_gain,
+            iteration_limit=iteration_limit,
+        )  # fmt: skip
+        super().__init__(controller, "consensus-mpc", 0)
+
+    def _decide(self, obs: Actions, state: PolicyState, start: Flags) -> tuple[Actions, PolicyState]:
+        parts, memory = self._decode(obs, state.memory, start)
+        decision = self._control(parts, None, memory)
+        return self._act(decision, np.empty((len(obs), 0)), None, state, start)
+
+
+class TargetMpc(CooperativePolicy):
+    """The cooperative MPC beside a target that each agent estimates, or is told of by the wrapper, chapter 7.
+
+    Args:
+        controller: Of the team.
+        estimator: The agents' filters; None: the estimates in the observation.
+    """
+
+    def __init__(self, controller: CooperativeMpc, estimator: TargetEstimator | None) -> None:
+        super().__init__(controller, "cooperative-mpc", 0 if estimator is None else FILTER_SIZE)
+        self.estimator = estimator
+
+    def _decide(self, obs: Actions, state: PolicyState, start: Flags) -> tuple[Actions, PolicyState]:
+        if self.estimator is None:
+            parts, memory = self._decode(obs, state.memory, start)
+            estimates, filters = shared_estimates(parts.estimate), np.empty((len(obs), 0))
+        else:
+            parts, memory, filters, _ = done = self.estimator.step(obs, state.memory, start)
+            estimates = done.estimates
+        decision = self._control(parts, estimates, memory)
+        return self._act(decision, filters, estimates, state, start)
+
+
+def make_cooperative_mpc(
+    task: TeamTask,
+    horizon: int = 5,
+    alpha: float = 1.0,
+    terminal_weight: CooperativeTerminalWeight = "hover",
+    *,
+    q: float | None = None,
+    estimates: EstimateSource | None = None,
+    neighbour: Neighbour = "cv",
+    feed_forward: bool = True,
+    attitude: bool = False,
+    reach: float = 2.0,
+    speed: float = 2.0,
+    formation_weight: float = 0.1,
+    target: TargetModel = "cv",
+    avoidance: AvoidanceRule = "reciprocal",
+    avoidance_set: AvoidanceSet = "sensed",
+    moving_centre: bool = True,
+    braking_time: float = 0.25,
+    swirl: float = math.radians(5.0),
+    separation_weight: float = 1e4,
+    soft_weight: float = 1e3,
+    margin: float = 0.02,
+    reject_disturbance: bool = False,
+    estimator_gain: float = ESTIMATOR_GAIN,
+    iteration_limit: int = ITERATION_LIMIT,
+) -> TeamPolicy:
+    """The policy of chapter 7. Where vehicles run on rails, its answer is its estimate.
+
+    Args:
+        task: With a target.
+        horizon: See `controllers.cooperative_mpc.CooperativeMpc`, as all others but the next two.
+        alpha: See there.
+        terminal_weight: See there.
+        q: Density of the target's acceleration in the filter, m^2/s^3; None: 0.02 for estimation, 0.05 for
+            tracking.
+        estimates: "own": a filter per agent in `state`; "shared": the estimates that `EstimateWrapper` put
+            into the observation; None: shared where they are there.
+        neighbour: See there.
+        feed_forward: See there.
+        attitude: See there.
+        reach: See there; 2 m, since the target is far at the start.
+        speed: See there.
+        formation_weight: P_f of (7.2), m^2.
+        target: See there.
+        avoidance: See there.
+        avoidance_set: See there.
+        moving_centre: See there.
+        braking_time: See there.
+        swirl: See there.
+        separation_weight: See there.
+        soft_weight: See there.
+        margin: See there.
+        reject_disturbance: See there.
+        estimator_gain: See there.
+        iteration_limit: See there.
+
+    Raises:
+        ValueError: If the task has no target, or an option is not allowed.
+    """
+    shared = _shares_estimates(task, estimates)
+    estimator = None if shared else TargetEstimator(task, q)
+    controller = CooperativeMpc(
+        task, horizon, alpha, terminal_weight, neighbour=neighbour, feed_forward=feed_forward,
+        attitude=attitude, reach=reach, speed=speed, formation_weight=formation_weight, target=target,
+        avoidance=avoidance, avoidance_set=avoidance_set, moving_centre=moving_centre,
+        braking_time=braking_time, swirl=swirl, separation_weight=separation_weight,
+        soft_weight=soft_weight, margin=margin, reject_disturbance=reject_disturbance,
+        estimator_gain=estimator_gain, iteration_limit=iteration_limit,
+    )  # fmt: skip
+    if task.mission != "estimation":
+        return TargetMpc(controller, estimator)
+    if shared:
+        return SharedEstimatePolicy(task, "cooperative-mpc")
+    return EstimatorPolicy(task, "cooperative-mpc", q, trilaterate=False)
+
+
+def _shares_estimates(task: TeamTask, estimates: Any) -> bool:
+    """Whether the estimates come from the observation.
+
+    Raises:
+        ValueError: If there is no such source, or the observation has no estimates.
+    """
+    if estimates is None:
+        return task.layout.estimate
+    if estimates not in get_args(EstimateSource):
+        raise ValueError(unknown_name("value of estimates", estimates, get_args(EstimateSource)))
+    if estimates == "shared" and not task.layout.estimate:
+        raise ValueError(
+            f"estimates='shared' needs estimates in the observation of {task.env_id!r}: put an "
+            "EstimateWrapper around the environment, or take estimates='own'"
+        )
+    return bool(estimates == "shared")
