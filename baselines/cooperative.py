@@ -63,9 +63,6 @@ class CooperativePolicy(TeamPolicy):
     def _control(self, parts: Decoded, estimates: Estimates | None, memory: Array) -> CooperativeDecision:
         """The controller's decision."""
         n, layout = len(parts.plant), self.task.layout
-        target: tuple[Array | None, ...] = (None, None, None, None)
-        if estimates is not None:
-            target = estimates.r, estimates.v, estimates.P[:, :3, :3], parts.slot
         return self.controller.decide(
             parts.plant,
             parts.last_command,
@@ -73,7 +70,10 @@ class CooperativePolicy(TeamPolicy):
             parts.preview.reshape(n, layout.preview + 1, N_REFERENCE),
             parts.comm.reshape(n, layout.neighbours, layout.comm_size),
             parts.sensed.reshape(n, layout.sensed, N_SENSED),
-            *target,
+            estimates.r if estimates is not None else None,
+            estimates.v if estimates is not None else None,
+            estimates.P[:, :3, :3] if estimates is not None else None,
+            parts.slot if estimates is not None else None,
             parts.disturbance,
             memory,
         )

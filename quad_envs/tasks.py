@@ -60,6 +60,9 @@ class TeamTask(BaseTask):
     layout: AgentLayout = field(default_factory=AgentLayout)
     mission: str = "formation"  # or "target-tracking", "estimation"
     vehicles: int = 6
+    slots: tuple[
+        _Triple, ...
+    ] = ()  # m, wanted positions of the vehicles relative to the leader, or the target
     separation: float = 0.4  # m, d_s, smallest distance between two vehicles
     crash_distance: float = 0.33  # m, d_crash, tip to tip
     sensing_radius: float = 2.0  # m, R_s
@@ -79,3 +82,15 @@ class TeamTask(BaseTask):
     def action_size(self) -> int:
         """Numbers in an action: rotor commands, then the plan where it is shared; or an estimate."""
         return 6 if self.mission == "estimation" else 4 + 6 * self.layout.plan
+
+    @property
+    def state_slices(self) -> dict[str, slice]:
+        """Name -> slice of the environment's `state()`: plants, target, graph, preview, time."""
+        n, stages = self.vehicles, self.layout.preview + 1
+        out, start = {}, 0
+        for name, size in (
+            *(("plants", 16 * n), ("target", 6), ("graph", n * n), ("preview", 8 * stages), ("time", 1)),
+        ):
+            out[name] = slice(start, start + size)
+            start += size
+        return out

@@ -166,6 +166,7 @@ class TeamOptions(VehicleOptions):
             layout=layout,
             mission=self.mission,
             vehicles=int(self.vehicles),
+            slots=tuple((float(x), float(y), float(z)) for x, y, z in slots),
             separation=self.separation,
             crash_distance=self.crash_distance,
             sensing_radius=self.sensing_radius,
