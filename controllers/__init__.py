@@ -1,6 +1,9 @@
-"""Control of one vehicle: linear, state-dependent and exact MPC, feedback laws, and their solvers."""
+"""Control of a vehicle and of teams: linear, state-dependent and exact MPC, feedback laws, and solvers."""
 
+from .collision import AvoidanceOptions
+from .consensus import ConsensusOptions, TargetEstimate, consensus_reference
 from .controller import Controller, Decision
+from .cooperative_mpc import CooperativeDecision, CooperativeMpc
 from .fallback import Fallback
 from .feedback_linearization import FeedbackLinearization
 from .lmpc import LinearMPC
@@ -12,7 +15,11 @@ from .sdc_nmpc import SdcNmpc
 from .sdre import Lqr, Sdre
 
 __all__ = [
+    "AvoidanceOptions",
+    "ConsensusOptions",
     "Controller",
+    "CooperativeDecision",
+    "CooperativeMpc",
     "Decision",
     "ExactNmpc",
     "Fallback",
@@ -23,6 +30,8 @@ __all__ = [
     "SdcNmpc",
     "Sdre",
     "StateRows",
+    "TargetEstimate",
+    "consensus_reference",
     "dare",
     "hover_pair",
     "lqr_gain",

@@ -38,7 +38,7 @@ class RowLayout(NamedTuple):
     slot_normals: int  # normals and rows of one vehicle to keep away from
     slot_rows: int
     message: int  # numbers in a comm slot
-    pairs: int  # (A, B), 1
+    pairs: int  # 1, here because a literal would have `carve` compiled once more
 
 
 @kernel

