@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -10,13 +11,14 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .comparison import Results
 from .engines import check_engine, run_units
 from .environments import make_env
 from .errors import ResultsError
 from .evaluation import Evaluation, evaluate
-from .policy import make_policy
+from .policy import make_policy, mission_of, policy_entry
 from .results import (
     discard,
     locked,
@@ -36,7 +38,9 @@ from .suite import Suite, Unit, load_suite, suite_units
 def fly_unit(unit: Unit) -> dict[str, Any]:
     """Fly one unit; the form in which it is stored in cells/."""
     begin = perf_counter()
-    env = make_env(unit.env.id, **unit.env.kwargs)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # said once before the first unit
+        env = make_env(unit.env.id, **unit.env.kwargs)
     policy = make_policy(unit.policy.name, env, **unit.policy.kwargs)
     save = None if unit.episode_folder is None else _saver(unit)
     found = evaluate(policy, env, unit.episodes, unit.seed, on_episode=save)
@@ -46,19 +50,52 @@ def fly_unit(unit: Unit) -> dict[str, Any]:
 
 
 def _saver(unit: Unit) -> Callable[[Episode], None]:
-    """Writes each flight to episodes/."""
+    """Writes each flight to episodes/, as soon as all vehicles of a team have given theirs."""
+    team: list[Episode] = []
 
     def save(episode: Episode) -> None:
+        team.append(episode)
+        if len(team) < episode.team_size:
+            return
+        arrays: dict[str, Any] = flight_arrays(team)
+        team.clear()
         path = unit.episode_file(episode.seed)
         assert path is not None
-        arrays: dict[str, Any] = {
-            key: value for key, value in episode._asdict().items() if isinstance(value, np.ndarray)
-        }
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **arrays)
         write_atomic(path, buffer.getvalue())
 
     return save
+
+
+def flight_arrays(team: Sequence[Episode]) -> dict[str, NDArray[Any]]:
+    """The arrays of a flight in the form of episodes/*.npz.
+
+    Of one vehicle those of its Episode. Of a team the same and its signals, stacked with the vehicles first,
+    with `agent` their names and `lengths` the steps that each flew: what lies behind, where one left early,
+    is nan, or zero where there are only whole numbers.
+    """
+    plain = [
+        {key: value for key, value in episode._asdict().items() if isinstance(value, np.ndarray)}
+        | {key: np.asarray(value) for key, value in episode.signals.items()}
+        for episode in team
+    ]
+    if not team[0].agent:
+        return plain[0]
+    out = {key: _stack_ragged([arrays[key] for arrays in plain]) for key in plain[0]}
+    out["agent"] = np.array([episode.agent for episode in team])
+    out["lengths"] = np.array([len(episode.rewards) for episode in team])
+    out["crashed"] = np.array([episode.crashed for episode in team])
+    return out
+
+
+def _stack_ragged(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    longest = max(len(array) for array in arrays)
+    fill = np.nan if np.issubdtype(arrays[0].dtype, np.floating) else 0
+    out = np.full((len(arrays), longest, *arrays[0].shape[1:]), fill, dtype=arrays[0].dtype)
+    for row, array in zip(out, arrays, strict=True):
+        row[: len(array)] = array
+    return out
 
 
 def run_benchmark(
@@ -125,7 +162,14 @@ def _refuse_bad_units(suite: Suite) -> None:
     for choice in suite.envs:
         env = make_env(choice.id, **choice.kwargs)
         for policy in suite.policies:
-            make_policy(policy.name, env, **policy.kwargs)
+            if not policy.flies_in(choice):
+                continue
+            try:
+                make_policy(policy.name, env, **policy.kwargs)
+            except ValueError as error:
+                if mission_of(env.unwrapped.task) in policy_entry(policy.name).missions:
+                    raise
+                raise ValueError(f"{error}. Say in the suite for which it is: envs = [...]") from error
         env.close()
 
 

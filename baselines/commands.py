@@ -5,16 +5,25 @@ from __future__ import annotations
 import json
 import shlex
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from quad_envs.names import unknown_name
 
 from .options import BenchmarkOptions, EvaluateOptions, ListOptions, read_assignments
+
+# What the multi-agent environments are, for `list`, which loads none of them.
+TEAM_KINDS = {
+    "quad/Formation-v0": "formation: quadrotors take and keep their slots behind a leader",
+    "quad/TargetTracking-v0": "target-tracking: quadrotors keep their slots beside a target they measure",
+    "quad/CooperativeEstimation-v0": "estimation: vehicles on rails estimate the motion of a target",
+}
 
 
 def say(text: str) -> None:
@@ -31,25 +40,56 @@ def progress(total: int, unit: str) -> Iterator[Any]:
         yield bar
 
 
+@contextmanager
+def plain_warnings() -> Iterator[None]:
+    """Print what an environment warns of as one line on stderr, each text once."""
+    said: set[str] = set()
+
+    def show(message: Warning | str, *details: Any, **more: Any) -> None:
+        text = " ".join(str(message).split())
+        if text not in said:
+            said.add(text)
+            say(f"quad-envs: warning: {text}")
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = show
+        yield
+
+
 def list_names(options: ListOptions) -> int:
     """Print what there is, or the options of one environment or policy."""
     from quad_envs.registration import TRACKING
 
-    from .policy import TRACKING_POLICIES
+    from .policy import TEAM_POLICIES, TRACKING_POLICIES
     from .suite import suite_names
 
     if options.name:
         return _list_options(options)
     policies = {name: entry.description for name, entry in TRACKING_POLICIES.items()}
-    found = {"environments": TRACKING, "policies": policies, "suites": suite_names()}
+    team = {
+        name: f"{entry.description}; for {', '.join(entry.missions)}{' (privileged)' * entry.privileged}"
+        for name, entry in TEAM_POLICIES.items()
+    }
     if options.json:
-        print(json.dumps(found, indent=1))
+        found = {"environments": TRACKING, "team_environments": TEAM_KINDS}
+        print(
+            json.dumps(
+                found | {"policies": policies, "team_policies": team, "suites": suite_names()}, indent=1
+            )
+        )
         return 0
     envs = {
         name: ", ".join(f"{key}={value!r}" for key, value in kwargs.items())
         for name, kwargs in TRACKING.items()
     }
-    for title, entries in (("environments", envs), ("policies", policies), ("suites", suite_names())):
+    for title, entries in (
+        ("environments of one vehicle (Gymnasium)", envs),
+        ("environments of several vehicles (PettingZoo)", TEAM_KINDS),
+        ("policies for one vehicle", policies),
+        ("policies for several vehicles", team),
+        ("suites", suite_names()),
+    ):
         print(title)
         for name, text in entries.items():
             print(f"  {name:28} {text}")
@@ -60,20 +100,23 @@ def list_names(options: ListOptions) -> int:
 def _list_options(options: ListOptions) -> int:
     from dataclasses import fields
 
-    from quad_envs.registration import TRACKING
+    from quad_envs.registration import TEAMS, TRACKING
 
-    from .policy import TRACKING_POLICIES, policy_options
+    from .policy import TEAM_POLICIES, TRACKING_POLICIES, policy_options
 
-    if options.name in TRACKING:
-        from quad_envs.envs.options import TrackingOptions
-
-        values = {entry.name: entry.default for entry in fields(TrackingOptions)} | TRACKING[options.name]
+    names = [*TRACKING, *TEAMS, *TRACKING_POLICIES, *TEAM_POLICIES]
+    if options.name in (*TRACKING, *TEAMS):
+        if options.name in TEAMS:
+            kind = import_module(TEAMS[options.name]).raw_env.options_type
+        else:
+            from quad_envs.envs.options import TrackingOptions as kind
+        values = {entry.name: entry.default for entry in fields(kind)} | TRACKING.get(options.name, {})
         del values["env_id"]
         flag = "--set"
-    elif options.name in TRACKING_POLICIES:
+    elif options.name in names:
         values, flag = policy_options(options.name), "--policy-set"
     else:
-        raise ValueError(unknown_name("name", options.name, [*TRACKING, *TRACKING_POLICIES]))
+        raise ValueError(unknown_name("name", options.name, names))
     if options.json:
         print(json.dumps(values, indent=1, default=str))
         return 0
@@ -99,14 +142,18 @@ def evaluate_one(options: EvaluateOptions) -> int:
     if options.out is not None:
         choices = (EnvChoice(options.env, env_kwargs),), (PolicyChoice(options.policy, policy_kwargs),)
         suite = Suite("evaluate", *choices, options.episodes, options.seed)
-        results = run_benchmark(suite, options.out, save_episodes=options.save_episodes, fresh=options.fresh)
+        with plain_warnings():
+            results = run_benchmark(
+                suite, options.out, save_episodes=options.save_episodes, fresh=options.fresh
+            )
         found = results.evaluations[0]
         say(f"results in {options.out}")
     else:
-        env = make_env(options.env, **env_kwargs)
+        with plain_warnings():
+            env = make_env(options.env, **env_kwargs)
         policy = make_policy(options.policy, env, **policy_kwargs)
         with progress(options.episodes, "flight") as bar:
-            count = lambda episode: bar.update()  # noqa: E731
+            count = lambda episode: bar.update(episode.seed - options.seed + 1 - bar.n)  # noqa: E731
             found = evaluate(policy, env, options.episodes, options.seed, on_episode=count)
     print(json.dumps(found.to_dict(), indent=1, allow_nan=False) if options.json else found)
     return 0
@@ -115,7 +162,7 @@ def evaluate_one(options: EvaluateOptions) -> int:
 def benchmark_suite(options: BenchmarkOptions) -> int:
     """Fly a suite, print its tables, and leave a results folder."""
     from .benchmark import run_benchmark
-    from .suite import load_suite
+    from .suite import load_suite, suite_units
 
     suite = load_suite(options.suite)
     changes = {
@@ -124,7 +171,7 @@ def benchmark_suite(options: BenchmarkOptions) -> int:
     suite = replace(suite, **changes)
     out = options.out or Path("runs") / f"{suite.name}-{datetime.now():%Y%m%d-%H%M%S}"
     finished = 0
-    with progress(len(suite.envs) * len(suite.policies), "unit") as bar:
+    with progress(len(suite_units(suite)), "unit") as bar, plain_warnings():
 
         def on_unit(count: int, total: int) -> None:
             nonlocal finished

@@ -2,15 +2,47 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
-from .evaluation import Evaluation
+from .evaluation import NO_SPANNING_TREE, Evaluation
 from .metrics import paired_difference, totals, worst_violations
 from .suite import EnvChoice, Suite, Unit, suite_units
 from .table import format_number, format_table
 
 COMPARED = ("score", "cost", "position_rms", "effort")  # columns with paired differences
+COMPARED_TEAM = ("formation_rms", "min_separation", "estimate_rmse")  # and of a team
+_FAILED = ("relaxed", "previous_plan", "clipped_sdre", "hover")
+# Columns of the printed table: title, key of the summary row, factor. Where they end stand the limits.
+_COLUMNS = (
+    ("score", "score", 1.0),
+    ("- {base}", "score_minus_base", 1.0),
+    ("+-", "score_minus_base_ci", 1.0),
+    ("cost", "cost", 1.0),
+    ("RMS m", "position_rms", 1.0),
+    ("steady m", "steady_rms", 1.0),
+    ("effort N^2", "effort", 1.0),
+    ("violating %", "violation_share", 100.0),
+)
+_TEAM_COLUMNS = (
+    ("final m", "formation_final", 1.0),
+    ("worst m", "formation_final_worst", 1.0),
+    ("settling s", "formation_settling", 1.0),
+    ("separation m", "min_separation", 1.0),
+    ("z max m", "z_error_max", 1.0),
+    ("estimate m", "estimate_rmse", 1.0),
+    ("worst m", "estimate_rmse_worst", 1.0),
+    ("ANEES", "anees", 1.0),
+    ("NIS", "nis_ratio", 1.0),
+)
+_LAST_COLUMNS = (
+    ("saturated %", "saturation_share", 100.0),
+    ("p50 ms", "decision_p50_ms", 1.0),
+    ("p99 ms", "decision_p99_ms", 1.0),
+    ("team p50 ms", "team_p50_ms", 1.0),
+    ("team p99 ms", "team_p99_ms", 1.0),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +60,7 @@ class Results:
         raise KeyError(f"no evaluation of {policy!r} in {env!r}")
 
     def rows(self) -> list[dict[str, Any]]:
-        """One row per environment x policy x flight."""
+        """One row per environment x policy x flight, of a team one per vehicle (column agent)."""
         units = suite_units(self.suite)
         return [
             {"env": unit.env.title, "policy": unit.policy.title, **record.row()}
@@ -40,24 +72,36 @@ class Results:
         """One row per environment x policy: means, half widths (_ci), paired differences (_minus_base)."""
         return [self._summary_row(unit) for unit in suite_units(self.suite)]
 
+    def base_of(self, env: str) -> str:
+        """Title of the policy from which differences are taken: the suite's, else the first flown there."""
+        flown = [unit.policy.title for unit in suite_units(self.suite) if unit.env.title == env]
+        return self.suite.base if self.suite.base in flown else flown[0]
+
     def _summary_row(self, unit: Unit) -> dict[str, Any]:
-        ours, base = self.get(unit.env.title, unit.policy.title), self.get(unit.env.title, self.suite.base)
+        ours = self.get(unit.env.title, unit.policy.title)
+        base = self.get(unit.env.title, self.base_of(unit.env.title))
         row: dict[str, Any] = {
             "env": unit.env.title,
             "policy": unit.policy.title,
-            "episodes": len(ours.records),
+            "episodes": ours.flights,
         }
-        for name, value in ours.summary().items():
+        summary = ours.summary()
+        for name, value in summary.items():
             row[name], row[f"{name}_ci"] = value.mean, value.half_width
-        for name in COMPARED:
-            difference = paired_difference(ours.records, base.records, name)
-            row[f"{name}_minus_base"], row[f"{name}_minus_base_ci"] = difference.mean, difference.half_width
+        for name in (*COMPARED, *COMPARED_TEAM):
+            if name in summary:
+                difference = paired_difference(ours.records, base.records, name)
+                row[f"{name}_minus_base"], row[f"{name}_minus_base_ci"] = (
+                    difference.mean,
+                    difference.half_width,
+                )
         row |= totals(ours.records)
         row["iterations_max"] = max(record.iterations_max for record in ours.records)
         row |= {f"worst_{name}": value for name, value in worst_violations(ours.records).items()}
-        row |= dict(
-            zip(("decision_p50_ms", "decision_p99_ms", "decision_max_ms"), ours.decision_ms, strict=True)
-        )
+        row |= _timed("decision", ours.decision_ms)
+        if ours.spanning_tree is not None:
+            row |= _timed("team", ours.team_ms)
+            row |= {name: getattr(ours, name) for name in ("vehicles", "privileged", "spanning_tree")}
         return row
 
     def to_dict(self) -> dict[str, Any]:
@@ -65,34 +109,37 @@ class Results:
         return {"suite": self.suite.to_dict(), "evaluations": [one.to_dict() for one in self.evaluations]}
 
     def __str__(self) -> str:
-        return "\n\n".join(self._table(env) for env in self.suite.envs)
+        flown = {unit.env.title for unit in suite_units(self.suite)}
+        return "\n\n".join(self._table(env) for env in self.suite.envs if env.title in flown)
 
     def _table(self, env: EnvChoice) -> str:
         rows = [row for row in self.summary() if row["env"] == env.title]
         limits = [key for key in rows[0] if key.startswith("worst_")]  # differ in unit, so never merged
-        header = ["policy", "score", f"- {self.suite.base}", "+-", "cost", "RMS m", "steady m", "effort N^2"]
-        header += ["violating %", *(key.replace("_", " ") for key in limits)]
-        header += ["crashes", "saturated %", "p50 ms", "p99 ms", "fallbacks"]
+        before, after, team = list(_COLUMNS), list(_LAST_COLUMNS), "vehicles" in rows[0]
+        if team:
+            before[4:6] = _TEAM_COLUMNS
+        before += [(key.replace("_", " "), key, 1.0) for key in limits]
+        if not team:
+            after = [column for column in after if column[1] in rows[0]]
+        else:  # what means nothing here is nan in every row
+            before, after = (
+                [column for column in columns if any(math.isfinite(row[column[1]]) for row in rows)]
+                for columns in (before, after)
+            )
+        titles = [
+            [title.format(base=self.base_of(env.title)) for title, *_ in part] for part in (before, after)
+        ]
         lines = []
         for row in rows:
-            columns = [
-                "score",
-                "score_minus_base",
-                "score_minus_base_ci",
-                "cost",
-                "position_rms",
-                "steady_rms",
-                "effort",
-            ]
-            numbers = [
-                *(row[name] for name in columns),
-                100.0 * row["violation_share"],
-                *(row[key] for key in limits),
-            ]
-            failed = sum(row[name] for name in ("relaxed", "previous_plan", "clipped_sdre", "hover"))
-            times = row["decision_p50_ms"], row["decision_p99_ms"]
-            cells = [row["policy"], *map(format_number, numbers), str(row["crashed"])]
-            cells += [*map(format_number, (100.0 * row["saturation_share"], *times)), str(failed)]
-            lines.append(cells)
+            first, last = ([format_number(f * row[key]) for _, key, f in part] for part in (before, after))
+            name = row["policy"] + (" (privileged)" if row.get("privileged") else "")
+            failed = sum(row[name] for name in _FAILED)
+            lines.append([name, *first, str(row["crashed"]), *last, str(failed)])
+        header = ["policy", *titles[0], "crashes", *titles[1], "fallbacks"]
         seeds = f"seeds {self.suite.seed} to {self.suite.seed + self.suite.episodes - 1}"
-        return f"{env.title}, {seeds}\n{format_table(header, lines)}"
+        note = "" if rows[0].get("spanning_tree", True) else f"\nnote: {NO_SPANNING_TREE}"
+        return f"{env.title}, {seeds}{note}\n{format_table(header, lines)}"
+
+
+def _timed(what: str, quantiles: tuple[float, float, float]) -> dict[str, float]:
+    return dict(zip((f"{what}_p50_ms", f"{what}_p99_ms", f"{what}_max_ms"), quantiles, strict=True))

@@ -36,7 +36,7 @@ class Finding(NamedTuple):
 
 def examine(as_json: bool) -> int:
     """Run all checks and print them; 0 if all is well, else 1."""
-    checks = (_versions, _shadowing, _cache, _self_test, _extras)
+    checks = (_versions, _shadowing, _cache, _self_test, _team_test, _extras)
     findings = [_run(check) for check in checks]
     if as_json:
         print(json.dumps([finding._asdict() for finding in findings], indent=1))
@@ -50,7 +50,7 @@ def _run(check: Callable[[], Finding]) -> Finding:
     try:
         return check()
     except Exception as error:  # a check that breaks is a finding
-        return Finding(check.__name__.strip("_"), False, f"{type(error).__name__}: {error}")
+        return Finding(check.__name__.strip("_").replace("_", "-"), False, f"{type(error).__name__}: {error}")
 
 
 def _versions() -> Finding:
@@ -122,6 +122,29 @@ def _self_test() -> Finding:
     ok = 0.0 < float(reward) <= 1.0
     times = f"first step and LMPC decision {first:.2f} s, second decision {decision:.3f} ms"
     return Finding("self-test", ok, f"{times}, reward {float(reward):.3f}")
+
+
+def _team_test() -> Finding:
+    """The same of a formation: one step and one decision of the whole team."""
+    import numpy as np
+
+    from .environments import make_env
+    from .policy import make_policy
+
+    begin = perf_counter()
+    env = make_env("quad/Formation-v0")
+    seen, _ = env.reset(seed=0)
+    policy = make_policy("consensus-mpc", env)
+    observations = np.stack([seen[name] for name in env.agents])
+    actions, state = policy.predict(observations)
+    rewards = env.step(dict(zip(env.agents, actions, strict=True)))[1].values()
+    first = perf_counter() - begin
+    begin = perf_counter()
+    policy.predict(observations, state)
+    decision = 1e3 * (perf_counter() - begin)
+    ok = all(0.0 < float(reward) <= 1.0 for reward in rewards)
+    times = f"first step and decision of {len(observations)} vehicles {first:.2f} s, second {decision:.3f} ms"
+    return Finding("team-test", ok, f"{times}, least reward {min(rewards):.3f}")
 
 
 def _extras() -> Finding:

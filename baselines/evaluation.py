@@ -1,16 +1,20 @@
-"""`evaluate`: one policy in one environment, over several starts."""
+"""`evaluate`: one policy in one environment, or one team of its vehicles, over several starts."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
+from quad_envs.tasks import BaseTask, TeamTask
+
 from .environments import make_env
 from .metrics import (
+    AVERAGED,
+    CUT_SHORT,
     Estimate,
     Record,
     decision_quantiles,
@@ -21,8 +25,9 @@ from .metrics import (
 )
 from .policy import Policy
 from .results import plain_json
-from .rollout import Episode, run_episodes
+from .rollout import Episode, is_privileged, run_episodes
 from .table import format_number, format_table
+from .team_metrics import TEAM_COLUMNS, TEAM_CUT_SHORT, by_flight, flight_values, has_team
 
 _UNITS = {
     "score": "-",
@@ -33,7 +38,13 @@ _UNITS = {
     "settling_time": "s",
     "violation_share": "-",
     "saturation_share": "-",
+    **TEAM_COLUMNS,
 }
+_NOT_TIMED = (math.nan, math.nan, math.nan)
+NO_SPANNING_TREE = (
+    "no spanning tree: from the leader, or from those who measure, news does not reach every vehicle, "
+    "and who is not reached cannot follow"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +56,25 @@ class Evaluation:
     seed: int  # of the first flight
     records: tuple[Record, ...]
     decision_ms: tuple[float, float, float]  # p50, p99, max over all decisions, ms; nan if not timed
+    team_ms: tuple[float, float, float] = _NOT_TIMED  # the same for all vehicles of a team at once
+    vehicles: int = 1  # of a team
+    spanning_tree: bool | None = None  # whether news can reach every vehicle of a team; None for one vehicle
+    privileged: bool = False  # whether the policy saw the whole truth
+
+    @property
+    def title(self) -> str:
+        """Name of the policy for tables, which says if it is privileged."""
+        return f"{self.policy} (privileged)" if self.privileged else self.policy
+
+    @property
+    def flights(self) -> int:
+        """Flights, each of one vehicle or of one team."""
+        return len(by_flight(self.records))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What one has to know to read the numbers."""
+        return (NO_SPANNING_TREE,) if self.spanning_tree is False else ()
 
     def summary(self) -> dict[str, Estimate]:
         """Column -> mean and 95 % interval over the flights."""
@@ -55,24 +85,36 @@ class Evaluation:
         p50, p99, slowest = self.decision_ms
         found = {
             "env": self.env_id,
-            "policy": self.policy,
+            "policy": self.title,
             "seed": self.seed,
-            "episodes": len(self.records),
+            "episodes": self.flights,
             "summary": {name: value._asdict() for name, value in self.summary().items()},
             **totals(self.records),
             "iterations_max": max(record.iterations_max for record in self.records),
             "worst_violation": dict(worst_violations(self.records)),
             "decision_ms": {"p50": p50, "p99": p99, "max": slowest},
+            **self._of_team(),
             "records": [record.row() for record in self.records],
         }
         plain: dict[str, Any] = plain_json(found)
         return plain
 
+    def _of_team(self) -> dict[str, Any]:
+        """What only a team has."""
+        if self.spanning_tree is None:
+            return {}
+        return {
+            "vehicles": self.vehicles,
+            "privileged": self.privileged,
+            "spanning_tree": self.spanning_tree,
+            "notes": self.notes,
+            "team_decision_ms": dict(zip(("p50", "p99", "max"), self.team_ms, strict=True)),
+        }
+
     def to_plain(self) -> dict[str, Any]:
         """Everything in it, for storage as JSON; `from_plain` reads it."""
         records = [record._asdict() for record in self.records]
-        names = ("env_id", "policy", "seed", "decision_ms")
-        found = {name: getattr(self, name) for name in names} | {"records": records}
+        found = {entry.name: getattr(self, entry.name) for entry in fields(self)} | {"records": records}
         plain: dict[str, Any] = plain_json(found)
         return plain
 
@@ -86,31 +128,49 @@ class Evaluation:
         records = (
             Record(**{key: read(value) for key, value in record.items()}) for record in plain["records"]
         )
-        p50, p99, slowest = map(read, plain["decision_ms"])
-        return cls(plain["env_id"], plain["policy"], plain["seed"], tuple(records), (p50, p99, slowest))
+        times = {name: tuple(map(read, plain[name])) for name in ("decision_ms", "team_ms")}
+        return cls(**{**plain, **times, "records": tuple(records)})
 
     def __str__(self) -> str:
         rows = []
         for name, value in self.summary().items():
-            found = (getattr(record, name) for record in self.records)
-            column = [entry for entry in found if math.isfinite(entry) and value.n]
-            spread = [min(column), max(column)] if column else [math.nan, math.nan]
+            found = flight_values(self.records, name)
+            if not self._tells(name, found.values()):
+                continue
+            finite = [number for number in found.values() if math.isfinite(number)]
+            spread = (min(finite), max(finite)) if math.isfinite(value.mean) else (math.nan, math.nan)
             cells = [value.mean, value.half_width, *spread]
-            rows.append([name, _UNITS[name], *map(format_number, cells), str(value.n)])
+            unit = _UNITS[name.removesuffix("_worst")]
+            rows.append([name, unit, *map(format_number, cells), str(value.n)])
         table = format_table(["metric", "unit", "mean", "+- 95 %", "min", "max", "flights"], rows)
-        p50, p99, slowest = map(format_number, self.decision_ms)
         counts = totals(self.records).items()
         counted = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counts)
+        of_team = f" of {self.vehicles} vehicles" if has_team(self.records) else ""
         lines = [
-            f"{self.policy} on {self.env_id}, {len(self.records)} flights from seed {self.seed}",
+            f"{self.title} on {self.env_id}, {self.flights} flights{of_team} from seed {self.seed}",
+            *(f"note: {note}" for note in self.notes),
             table,
-            f"decisions: p50 {p50} ms, p99 {p99} ms, max {slowest} ms",
-            f"counts: {counted}",
+            f"decisions: {_times(self.decision_ms)}" + (" per vehicle" if of_team else ""),
         ]
+        if of_team:
+            lines.append(f"decisions of the whole team: {_times(self.team_ms)}")
+        lines.append(f"counts: {counted}")
         worst = worst_violations(self.records)
         if worst:
             lines.append("worst violation: " + ", ".join(f"{k} {format_number(v)}" for k, v in worst.items()))
         return "\n".join(lines)
+
+    def _tells(self, name: str, values: Iterable[float]) -> bool:
+        """Whether a column has anything to say: a number, or that a crash left none."""
+        if not has_team(self.records):
+            return name in AVERAGED
+        lost = name in (*CUT_SHORT, *TEAM_CUT_SHORT) and not name.startswith("estimate")
+        return any(map(math.isfinite, values)) or (lost and any(record.crashed for record in self.records))
+
+
+def _times(quantiles: tuple[float, float, float]) -> str:
+    p50, p99, slowest = map(format_number, quantiles)
+    return f"p50 {p50} ms, p99 {p99} ms, max {slowest} ms"
 
 
 def evaluate(
@@ -122,27 +182,40 @@ def evaluate(
 ) -> Evaluation:
     """Fly a policy from several starts and measure it.
 
-    Only numbers are kept of each flight, so that memory does not grow with its length.
+    Only numbers are kept of each flight, so that memory does not grow with its length. A team gives one
+    record per vehicle and flight; means and intervals are over flights.
 
     Args:
         policy: From `make_policy`, or anything with `predict`.
-        env: An id, a Gymnasium environment (decisions are timed), a vector environment or a ParallelEnv.
+        env: An id, a Gymnasium environment or a ParallelEnv (decisions are timed), or a vector environment.
         episodes: Number of flights, >= 1.
         seed: Flight i starts with the environment seed `seed + i`.
-        on_episode: Called with each flight, to save or plot it.
+        on_episode: Called with each flight, of a team with that of each vehicle, to save or plot it.
 
     Raises:
         ValueError: If the id is unknown or episodes < 1.
     """
-    env = make_env(env) if isinstance(env, str) else env
-    records, times = [], []
+    env, size = make_env(env) if isinstance(env, str) else env, 1
+    records, times, team_times = [], [], []
     for episode in run_episodes(policy, env, episodes, seed):
         records.append(measure(episode))
+        size = episode.team_size
         times.append(episode.decision_times.astype(np.float32))
+        team_times.append(size * times[-1])
         if on_episode is not None:
             on_episode(episode)
-    env_id, slowness = env.unwrapped.task.env_id, decision_quantiles(np.concatenate(times))
-    return Evaluation(env_id, policy_name(policy), seed, tuple(records), slowness)
+    task: BaseTask = env.unwrapped.task
+    return Evaluation(
+        env_id=task.env_id,
+        policy=policy_name(policy),
+        seed=seed,
+        records=tuple(records),
+        decision_ms=decision_quantiles(np.concatenate(times)),
+        team_ms=decision_quantiles(np.concatenate(team_times)) if size > 1 else _NOT_TIMED,
+        vehicles=size,
+        spanning_tree=task.spanning_tree if isinstance(task, TeamTask) else None,
+        privileged=is_privileged(policy),
+    )
 
 
 def policy_name(policy: Any) -> str:

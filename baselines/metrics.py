@@ -4,6 +4,8 @@ The columns stand side by side and are never merged into one. RMS and effort are
 RMS" and input effort: means over the samples k = 0..T-1 that were flown. What a crash cuts short, so that it
 would look cheap, is nan, and so are the mean and the paired difference of these columns (CUT_SHORT) as soon
 as one flight crashed: the mean over the survivors would favour a policy that crashes on the hard starts.
+
+A team gives one record per vehicle. Its vehicles are averaged within a flight before anything else.
 """
 
 from __future__ import annotations
@@ -15,8 +17,20 @@ import numpy as np
 
 from quad_envs.constraints import TOLERANCE
 from quad_envs.parameters import POSITION, Array
+from quad_envs.tasks import TeamTask
 
-from .rollout import Episode
+from .episode import Episode
+from .team_metrics import (
+    TEAM_CUT_SHORT,
+    TEAM_SUMMARY,
+    by_flight,
+    drop_team_columns,
+    flight_values,
+    has_team,
+    measure_team,
+)
+
+_NAN = float("nan")
 
 SETTLED = 0.05  # share of the initial position error below which the vehicle has settled
 SETTLING_LEAST = 0.1  # m, initial position error from which settling means anything
@@ -47,11 +61,26 @@ class Record(NamedTuple):
     iterations_max: int  # most solver iterations of a decision
     worst_violation: dict[str, float]  # constraint name -> largest excess over its limit, SI
     agent: str = ""
+    # Of a team's vehicle; nan where the task or the policy does not have them.
+    formation_rms: float = _NAN  # m, distance to the own slot
+    formation_final: float = _NAN  # m, its mean over the last second
+    formation_settling: float = _NAN  # s, last sample above 0.1 m; nan if it stays above to the end
+    min_separation: float = _NAN  # m, smallest distance to another vehicle
+    z_error_max: float = _NAN  # m, largest height error to the slot
+    z_error_rms: float = _NAN  # m
+    messages: float = _NAN  # heard per step
+    estimate_rmse: float = _NAN  # m, estimated position of the target, whole flight
+    estimate_sigma: float = _NAN  # m, sqrt(mean trace P) of that position, as the policy believes
+    anees: float = _NAN  # -, mean of e' P^-1 e of that position / 3; 1 for an honest filter
+    nis_ratio: float = _NAN  # -, mean of NIS / rows over the updates; 1 for an honest filter
+    trilateration_share: float = _NAN  # -, updates that entered as a trilaterated position
 
     def row(self) -> dict[str, Any]:
         """Flat form for tables: `worst_violation` becomes one column per constraint."""
         flat = self._asdict()
         worst = flat.pop("worst_violation")
+        if not self.agent:
+            flat = drop_team_columns(flat)
         return flat | {f"worst_{name}": value for name, value in worst.items()}
 
 
@@ -105,12 +134,15 @@ def measure(episode: Episode) -> Record:
         iterations_max=episode.worst_iterations,
         worst_violation=dict(zip(task.constraint_names, excess.tolist(), strict=True)),
         agent=episode.agent,
+        **measure_team(episode),
     )
 
 
 def _position_error(episode: Episode) -> Array:
-    """|p_k - p_ref,k| for k = 0..T-1, (T,); nan where the environment does not show its plant."""
+    """|p_k - p_ref,k| for k = 0..T-1, (T,); nan where plants are not shown or are not commanded."""
     steps = len(episode.rewards)
+    if isinstance(episode.task, TeamTask) and episode.task.mission == "estimation":
+        return np.full(steps, np.nan)
     if episode.states.shape[1] == 0 or len(episode.references) < steps:
         return np.full(steps, np.nan)
     error = episode.states[:steps, POSITION] - episode.references[:steps, POSITION]
@@ -130,6 +162,8 @@ def _settling_time(error: Array, dt: float) -> float:
 
 
 def _saturation_share(commands: Array, force_max: float) -> float:
+    if np.isnan(commands).any():  # actions that command no rotors
+        return float("nan")
     return float(((commands <= SATURATED) | (commands >= force_max - SATURATED)).mean())
 
 
@@ -167,7 +201,7 @@ def estimate(values: Iterable[float]) -> Estimate:
 
 
 def paired_difference(ours: Sequence[Record], theirs: Sequence[Record], column: str) -> Estimate:
-    """Mean of ours - theirs over flights from the same start.
+    """Mean of ours - theirs over flights from the same start, of teams over whole teams.
 
     The spread between starts is far larger than that between policies on one start. A column of CUT_SHORT has
     no difference, nan, where one of the paired flights crashed.
@@ -175,36 +209,43 @@ def paired_difference(ours: Sequence[Record], theirs: Sequence[Record], column: 
     Args:
         ours: Records of one policy.
         theirs: Records of another in the same environment.
-        column: One of AVERAGED.
+        column: One of AVERAGED, or of TEAM_SUMMARY.
 
     Raises:
         ValueError: If the column is not averaged, or no seed is in both.
     """
-    if column not in AVERAGED:
-        raise ValueError(f"column must be one of {', '.join(AVERAGED)}, got {column!r}")
-    other = {(record.seed, record.agent): record for record in theirs}
-    pairs = [(record, other[key]) for record in ours if (key := (record.seed, record.agent)) in other]
-    if not pairs:
+    if column not in (*AVERAGED, *TEAM_SUMMARY):
+        raise ValueError(f"column must be one of {', '.join((*AVERAGED, *TEAM_SUMMARY))}, got {column!r}")
+    one, other = flight_values(ours, column), flight_values(theirs, column)
+    seeds = dict.fromkeys(seed for seed in one if seed in other)
+    if not seeds:
         raise ValueError("paired_difference needs flights with the same seeds, and these have none in common")
-    if column in CUT_SHORT and any(one.crashed or two.crashed for one, two in pairs):
+    crashed = any(record.crashed for record in (*ours, *theirs) if record.seed in seeds)
+    if column in (*CUT_SHORT, *TEAM_CUT_SHORT) and crashed:
         return _NO_ESTIMATE
-    return estimate(getattr(one, column) - getattr(two, column) for one, two in pairs)
+    return estimate(one[seed] - other[seed] for seed in seeds)
 
 
 def summarize(records: Sequence[Record]) -> dict[str, Estimate]:
-    """Column -> estimate, for every averaged column; nan for those of CUT_SHORT if a flight crashed."""
+    """Column -> estimate over flights, for every averaged column and for a team's, if it is one.
+
+    Those of CUT_SHORT are nan if a flight crashed.
+    """
     crashed = any(record.crashed for record in records)
+    names = (*AVERAGED, *TEAM_SUMMARY) if has_team(records) else AVERAGED
     return {
         name: _NO_ESTIMATE
-        if crashed and name in CUT_SHORT
-        else estimate(getattr(record, name) for record in records)
-        for name in AVERAGED
+        if crashed and name in (*CUT_SHORT, *TEAM_CUT_SHORT)
+        else estimate(flight_values(records, name).values())
+        for name in names
     }
 
 
 def totals(records: Sequence[Record]) -> dict[str, int]:
-    """Column -> sum, for every counted column."""
-    return {name: int(sum(getattr(record, name) for record in records)) for name in COUNTED}
+    """Column -> sum, for every counted column; of crashes the flights, however many vehicles crash."""
+    counts = {name: int(sum(getattr(record, name) for record in records)) for name in COUNTED}
+    crashed = sum(any(record.crashed for record in team) for team in by_flight(records).values())
+    return counts | {"crashed": crashed}
 
 
 def worst_violations(records: Sequence[Record]) -> Mapping[str, float]:

@@ -29,8 +29,8 @@ class ListOptions:
 class EvaluateOptions:
     """Fly one policy in one environment."""
 
-    env: Annotated[str, Positional("environment id, as quad/HelixTracking-v0")]
-    policy: Annotated[str, Positional("policy, as sdc-nmpc")]
+    env: Annotated[str, Positional("environment id, as quad/HelixTracking-v0 or quad/Formation-v0")]
+    policy: Annotated[str, Positional("policy, as sdc-nmpc or consensus-mpc")]
     episodes: Annotated[int, "number of flights"] = 20
     seed: Annotated[int, "environment seed of the first flight"] = 0
     set: Annotated[list[str], "keyword argument of the environment; JSON, else text"] = field(

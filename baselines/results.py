@@ -2,8 +2,8 @@
 
 config.json        suite, versions, git revision, command
 cells/*.json       one finished unit (environment x policy) each
-episodes/*.npz     flights, if asked for
-results.csv        one row per environment x policy x flight, when all units are finished
+episodes/*.npz     flights, if asked for; a team in one file, vehicles first
+results.csv        one row per environment x policy x flight (x vehicle), when all units are finished
 summary.csv        one row per environment x policy
 """
 

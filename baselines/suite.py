@@ -10,6 +10,9 @@ envs = "all"                 # or a list of tables
 name = "sdc-nmpc"
 label = "sdc-nmpc, N 15"
 kwargs = {horizon = 15}
+
+"all" means the tracking ids, or policies. Multi-agent ids are named, and a policy that is not for all of the
+suite's environments says for which it is: `envs = ["quad/Formation-v0"]`, ids or labels.
 """
 
 from __future__ import annotations
@@ -22,9 +25,9 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from quad_envs.names import unknown_name
-from quad_envs.registration import TRACKING
+from quad_envs.registration import TEAMS, TRACKING
 
-from .policy import TRACKING_POLICIES
+from .policy import TEAM_POLICIES, TRACKING_POLICIES
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -53,11 +56,16 @@ class PolicyChoice:
     name: str
     kwargs: dict[str, Any] = field(default_factory=dict)
     label: str = ""
+    envs: tuple[str, ...] = ()  # ids or labels of the environments in which it flies; all if empty
 
     @property
     def title(self) -> str:
         """Label for tables."""
         return self.label or _title(self.name, self.kwargs)
+
+    def flies_in(self, env: EnvChoice) -> bool:
+        """Whether it is for an environment of the suite."""
+        return not self.envs or env.id in self.envs or env.title in self.envs
 
 
 def _title(name: str, kwargs: Mapping[str, Any]) -> str:
@@ -66,7 +74,7 @@ def _title(name: str, kwargs: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Suite:
-    """Every policy flies in every environment, from the same seeds.
+    """Every policy flies in every environment that it is for, from the same seeds.
 
     Raises:
         ValueError: If there is nothing to fly, a number is not allowed, or two titles are equal.
@@ -96,9 +104,22 @@ class Suite:
             for title in titles:
                 if titles.count(title) > 1:
                     raise ValueError(f"suite {self.name!r} has {title!r} twice in {kind}; give them labels")
+        self._check_pairs()
         titles = [policy.title for policy in self.policies]
         if self.compare_with and self.compare_with not in titles:
             raise ValueError(unknown_name(f"compare_with of suite {self.name!r}:", self.compare_with, titles))
+
+    def _check_pairs(self) -> None:
+        """Each name in `envs` of a policy is one of an environment here, and each environment is flown."""
+        known = list(dict.fromkeys(name for env in self.envs for name in (env.id, env.title)))
+        for policy in self.policies:
+            for name in policy.envs:
+                if name not in known:
+                    what = f"environment of policy {policy.title!r} in suite {self.name!r}"
+                    raise ValueError(unknown_name(what, name, known))
+        for env in self.envs:
+            if not any(policy.flies_in(env) for policy in self.policies):
+                raise ValueError(f"suite {self.name!r} has no policy for {env.title!r}")
 
     @property
     def base(self) -> str:
@@ -127,33 +148,34 @@ def suite_from_dict(data: Mapping[str, Any], name: str = "suite") -> Suite:
         if key not in data:
             raise ValueError(f'suite {name!r} needs {key}: a list of tables, or "all"')
     given = {key: value for key, value in data.items() if key != "description"}
-    given["envs"] = _choices(EnvChoice, "id", data["envs"], list(TRACKING), name)
-    given["policies"] = _choices(PolicyChoice, "name", data["policies"], list(TRACKING_POLICIES), name)
+    given["envs"] = _choices(EnvChoice, "id", data["envs"], list(TRACKING), list(TEAMS), name)
+    policies = list(TRACKING_POLICIES), [key for key in TEAM_POLICIES if key not in TRACKING_POLICIES]
+    given["policies"] = _choices(PolicyChoice, "name", data["policies"], *policies, name)
     return Suite(**{"name": name, **given})
 
 
 def _choices(
-    kind: type[_Choice], key: str, entries: Any, every: Sequence[str], suite: str
+    kind: type[_Choice], key: str, entries: Any, every: Sequence[str], more: Sequence[str], suite: str
 ) -> tuple[_Choice, ...]:
-    """The tables of a list, or all names."""
+    """The tables of a list, or every name; `more` are names that "all" leaves out."""
     if entries == "all":
         entries = [{key: name} for name in every]
     if not isinstance(entries, Sequence) or isinstance(entries, str):
         raise ValueError(
             f'suite {suite!r}: choose from a list of tables with {key!r}, or "all"; got {entries!r}'
         )
-    out = []
+    out, known = [], [entry.name for entry in fields(kind)]
     for entry in entries:
         if not isinstance(entry, str | Mapping):
             raise ValueError(f"suite {suite!r}: choose by name or by a table with {key!r}, got {entry!r}")
         table: dict[str, Any] = {key: entry} if isinstance(entry, str) else dict(entry)
         for name in table:
-            if name not in (key, "kwargs", "label"):
-                raise ValueError(unknown_name(f"key in suite {suite!r}:", name, (key, "kwargs", "label")))
+            if name not in known:
+                raise ValueError(unknown_name(f"key in suite {suite!r}:", name, known))
         if key not in table:
             raise ValueError(f"suite {suite!r}: each table needs {key!r}, got {table}")
-        if table[key] not in every:
-            raise ValueError(unknown_name(f"{key} in suite {suite!r}:", table[key], every))
+        if table[key] not in (*every, *more):
+            raise ValueError(unknown_name(f"{key} in suite {suite!r}:", table[key], [*every, *more]))
         if not isinstance(table.get("kwargs", {}), Mapping):
             raise ValueError(
                 f"suite {suite!r}: kwargs of {table[key]!r} must be a table, as {{horizon = 15}}, "
@@ -163,8 +185,20 @@ def _choices(
             raise ValueError(
                 f"suite {suite!r}: the label of {table[key]!r} must be text, got {table['label']!r}"
             )
+        if "envs" in table:
+            table["envs"] = _names(table["envs"], table[key], suite)
         out.append(kind(**table))
     return tuple(out)
+
+
+def _names(value: Any, policy: str, suite: str) -> tuple[str, ...]:
+    """The environments of a policy."""
+    if not isinstance(value, list | tuple) or not value or not all(isinstance(name, str) for name in value):
+        raise ValueError(
+            f"suite {suite!r}: envs of {policy!r} must be a list of ids or labels, got {value!r}; without "
+            "it the policy flies everywhere"
+        )
+    return tuple(value)
 
 
 def suite_names() -> dict[str, str]:
@@ -239,6 +273,6 @@ class Unit(NamedTuple):
 
 
 def suite_units(suite: Suite, episode_folder: Path | None = None) -> list[Unit]:
-    """All environments x policies."""
-    pairs = [(env, policy) for env in suite.envs for policy in suite.policies]
+    """All environments x policies that are for them."""
+    pairs = [(env, policy) for env in suite.envs for policy in suite.policies if policy.flies_in(env)]
     return [Unit(i, *pair, suite.episodes, suite.seed, episode_folder) for i, pair in enumerate(pairs)]

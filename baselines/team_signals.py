@@ -8,6 +8,7 @@
 | reward_terms | (T, terms) | parts of the stage cost, then violation / scale of each limit |
 | estimate_error | (T, 6) | estimated minus true [r, v] of the target when the policy decided, m and m/s |
 | estimate_covariance | (T, 6, 6) | what the policy gives as its covariance; nan where it gives none |
+| trilaterated | (T,) | whether the measurements entered as a trilaterated position |
 | nis, nis_rows | (T,) | normalised innovation squared of the last update, and the numbers in it |
 """
 
@@ -54,12 +55,14 @@ def estimate_signals(
     if found is None:
         return {}
     r = found.r + plants[:, POSITION] - targets[:, :3]
-    return {
+    out: dict[str, NDArray[Any]] = {
         "estimate_error": np.concatenate([r, found.v - targets[:, 3:]], axis=1),
         "estimate_covariance": found.P,
         "nis": found.nis,
         "nis_rows": found.rows,
     }
+    trilaterated = getattr(found, "trilaterated", None)
+    return out if trilaterated is None else out | {"trilaterated": trilaterated}
 
 
 def _believed(
