@@ -1,8 +1,8 @@
 """Derivatives of the step by its adjoint, for policy gradients through the dynamics.
 
 Reverse mode by hand: `step_vjp` takes the sensitivity of any scalar to the plant after a control period back
-to the plant before it and to the rotor commands, for about four times the cost of the step. The plain step is `dynamics.simulate`; the tests compare with
-central differences.
+to the plant before it and to the rotor commands, for about four times the cost of the step. The plain step is
+`dynamics.simulate`; the tests compare with central differences.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _MOST_SUBSTEPS = 64
 
 @inline_kernel
 def _dot(a: Array, x: float, y: float, z: float) -> float:
-    return a[0] * x + a[1] * y + a[2] * z
+    return float(a[0] * x + a[1] * y + a[2] * z)
 
 
 @kernel
@@ -109,7 +109,7 @@ def rigid_body_vjp(x: Array, F: Array, d: Array, c: Array, bar: Array, bar_x: Ar
 @inline_kernel
 def _derivative(x: Array, F: Array, d: Array, c: Array, out: Array) -> None:
     """`dynamics.rigid_body` into an array."""
-    k = rigid_body(x, F, d, c)
+    k = rigid_body(x, F, d, c)  # type: ignore[arg-type]  # arrays index like sequences
     out[0], out[1], out[2], out[3], out[4], out[5] = k[0], k[1], k[2], k[3], k[4], k[5]
     out[6], out[7], out[8], out[9], out[10], out[11] = k[6], k[7], k[8], k[9], k[10], k[11]
 
@@ -147,7 +147,7 @@ def _stages(
             ahead, decay = h, half * half
         for i in range(N_STATE):
             w[s, i] = x[i] + ahead * k[i]
-        _lag(F, command, top, decay, w[4 + s])
+        _lag(F, command, force_max, decay, w[4 + s])
         _derivative(w[s], w[4 + s], d, c, k)
         weight = h / 3.0 if s == 1 or s == 2 else h / 6.0
         for i in range(N_STATE):
@@ -158,7 +158,7 @@ def _stages(
 def _substep_vjp(
     h: float, decay: float, c: Array, d: Array, w: Array, bar_x: Array, bar_F: Array, bar_command: Array
 ) -> None:
-    """Take the sensitivities bar_x, bar_F back over the substep whose stages are in w; adds to bar_command."""
+    """Take bar_x and bar_F back over the substep whose stages are in w; adds to bar_command."""
     weighted, back, gx, gF = w[9], w[10], w[11], w[12]
     for i in range(N_STATE):
         weighted[i] = bar_x[i]
