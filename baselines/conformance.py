@@ -7,9 +7,10 @@ import pickle
 from typing import Any
 
 import numpy as np
+from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from .environments import make_env
+from .environments import is_parallel, make_env
 from .errors import PolicyCheckError
 from .policy import Policy
 
@@ -17,15 +18,18 @@ _STEPS = 12  # of each flight
 _ROWS = 3  # flights, from different seeds
 _BATCH_TOLERANCE = 1e-5  # a network's matrix products round differently for another number of rows
 
-Flights = NDArray[np.float32]  # (steps, rows, d), observations
+Flights = NDArray[Any]  # (steps, rows, d), observations
 
 
 def check_policy(policy: Policy, env: Any, seed: int = 0) -> None:
     """Test that a policy keeps the protocol: actions, state, independent rows, no hidden memory, pickling.
 
+    Rows are the observations of vehicles: of several flights of a Gymnasium environment, or of all agents of
+    a ParallelEnv. Those of a privileged policy are `env.state()`, a team each.
+
     Args:
         policy: To be tested; it flies a few steps.
-        env: A Gymnasium environment or an id; it is reset.
+        env: A Gymnasium environment, a PettingZoo ParallelEnv or an id; it is reset.
         seed: Of the first flight.
 
     Raises:
@@ -34,9 +38,18 @@ def check_policy(policy: Policy, env: Any, seed: int = 0) -> None:
     if not callable(getattr(policy, "predict", None)):
         raise PolicyCheckError(f"{policy!r} has no predict(observation, state, episode_start, deterministic)")
     env = make_env(env) if isinstance(env, str) else env
-    flights = _collect(policy, env, seed)
+    if not is_parallel(env):
+        space, flights = env.action_space, _collect(policy, env, seed)
+    else:
+        space = env.action_space(env.possible_agents[0])
+        if getattr(policy, "privileged", False):
+            n = len(env.possible_agents)
+            space = Box(*(np.broadcast_to(bound, (n, *space.shape)) for bound in (space.low, space.high)))
+            flights = _collect_states(policy, env, space, seed)
+        else:
+            flights = _collect_agents(policy, env, space, seed)
     _check_determinism(policy, flights)
-    _check_single(policy, env, flights)
+    _check_single(policy, space, flights)
     _check_no_mutation(policy, flights)
     _check_rows(policy, flights)
     _check_episode_start(policy, flights)
@@ -53,14 +66,24 @@ def _starts(n: int, value: bool) -> NDArray[np.bool_]:
     return np.full(n, value, dtype=np.bool_)
 
 
-def _check_action(action: Any, shape: tuple[int, ...], env: Any) -> None:
-    low, high = env.action_space.low, env.action_space.high
+def _check_action(action: Any, shape: tuple[int, ...], space: Any) -> None:
+    low, high = space.low, space.high
     _require(isinstance(action, np.ndarray), f"the action must be a numpy array, got {type(action).__name__}")
     _require(action.shape == shape, f"the action must have shape {shape}, got {action.shape}")
     _require(action.dtype == np.float32, f"the action must be float32, got {action.dtype}")
     _require(bool(np.isfinite(action).all()), f"the action must be finite, got {action.tolist()}")
     inside = bool((action >= low).all() and (action <= high).all())
-    _require(inside, f"the action must lie in {env.action_space}, got {action.tolist()}")
+    _require(inside, f"the action must lie in {space}, got {action.tolist()}")
+
+
+def _answer(policy: Policy, observations: NDArray[Any], state: Any, start: bool) -> tuple[Any, Any]:
+    """What predict returns, after a test that it is a pair."""
+    answer = policy.predict(observations, state, _starts(len(observations), start))
+    _require(
+        isinstance(answer, tuple) and len(answer) == 2,
+        f"predict must return (actions, state), got {type(answer).__name__}",
+    )
+    return answer
 
 
 def _collect(policy: Policy, env: Any, seed: int) -> Flights:
@@ -71,13 +94,8 @@ def _collect(policy: Policy, env: Any, seed: int) -> Flights:
         seen, state = [], None
         for k in range(_STEPS):
             seen.append(observation)
-            answer = policy.predict(observation[None], state, _starts(1, k == 0))
-            _require(
-                isinstance(answer, tuple) and len(answer) == 2,
-                f"predict must return (actions, state), got {type(answer).__name__}",
-            )
-            action, state = answer
-            _check_action(action, (1, *env.action_space.shape), env)
+            action, state = _answer(policy, observation[None], state, k == 0)
+            _check_action(action, (1, *env.action_space.shape), env.action_space)
             observation, _, terminated, truncated, _ = env.step(action[0])
             if terminated or truncated:
                 break
@@ -86,8 +104,42 @@ def _collect(policy: Policy, env: Any, seed: int) -> Flights:
     return np.stack([np.stack(seen[:steps]) for seen in flights], axis=1)
 
 
+def _collect_agents(policy: Policy, env: Any, space: Any, seed: int) -> Flights:
+    """Observations of all agents of a flight, as long as all of them fly."""
+    seen, _ = env.reset(seed=seed)
+    agents, state, flights = list(env.agents), None, []
+    for k in range(_STEPS):
+        observations = np.stack([seen[name] for name in agents])
+        flights.append(observations)
+        actions, state = _answer(policy, observations, state, k == 0)
+        _check_action(actions, (len(agents), *space.shape), space)
+        seen, *_ = env.step(dict(zip(agents, actions, strict=True)))
+        if env.agents != agents:
+            break
+    return np.stack(flights)
+
+
+def _collect_states(policy: Policy, env: Any, space: Any, seed: int) -> Flights:
+    """States of a few flights of a privileged policy; a row is a team."""
+    flights = []
+    for row in range(_ROWS):
+        env.reset(seed=seed + row)
+        agents, state = list(env.agents), None
+        seen: list[NDArray[Any]] = []
+        for k in range(_STEPS):
+            seen.append(env.state())
+            actions, state = _answer(policy, seen[-1][None], state, k == 0)
+            _check_action(actions, (1, *space.shape), space)
+            env.step(dict(zip(agents, actions[0], strict=True)))
+            if env.agents != agents:
+                break
+        flights.append(seen)
+    steps = min(map(len, flights))
+    return np.stack([np.stack(seen[:steps]) for seen in flights], axis=1)
+
+
 def _fly(policy: Policy, flights: Flights) -> NDArray[np.float32]:
-    """Actions on recorded observations, with the state threaded through, (steps, rows, 4)."""
+    """Actions on recorded observations, with the state threaded through, (steps, rows, ...)."""
     state, actions = None, []
     for k, observations in enumerate(flights):
         action, state = policy.predict(observations, state, _starts(len(observations), k == 0))
@@ -95,10 +147,10 @@ def _fly(policy: Policy, flights: Flights) -> NDArray[np.float32]:
     return np.stack(actions)
 
 
-def _check_single(policy: Policy, env: Any, flights: Flights) -> None:
+def _check_single(policy: Policy, space: Any, flights: Flights) -> None:
     """One observation without a batch axis."""
     action, _ = policy.predict(flights[0, 0], None, None)
-    _check_action(action, env.action_space.shape, env)
+    _check_action(action, space.shape, space)
     batched, _ = policy.predict(flights[0, :1], None, None)
     _require(
         bool(np.allclose(action, batched[0], rtol=0.0, atol=_BATCH_TOLERANCE)),

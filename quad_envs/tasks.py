@@ -60,9 +60,7 @@ class TeamTask(BaseTask):
     layout: AgentLayout = field(default_factory=AgentLayout)
     mission: str = "formation"  # or "target-tracking", "estimation"
     vehicles: int = 6
-    slots: tuple[
-        _Triple, ...
-    ] = ()  # m, wanted positions of the vehicles relative to the leader, or the target
+    slots: tuple[_Triple, ...] = ()  # m, wanted positions relative to the leader's, or to the target
     separation: float = 0.4  # m, d_s, smallest distance between two vehicles
     crash_distance: float = 0.33  # m, d_crash, tip to tip
     sensing_radius: float = 2.0  # m, R_s
