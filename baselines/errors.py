@@ -9,3 +9,7 @@ class PolicyCheckError(ValueError):
 
 class ResultsError(ValueError):
     """A results folder cannot be used; the message says why and what to do."""
+
+
+class CheckpointError(ValueError):
+    """A checkpoint cannot be read or written; the message says why and what to do."""

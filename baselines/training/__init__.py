@@ -1,0 +1,27 @@
+"""Learned policies: training, checkpoints, and inference without torch. Names load at first use."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .checkpoints import load_checkpoint, save_checkpoint
+    from .networks import Features, Network, NetworkPolicy
+
+# Public name -> module; loaded at first use, so that evaluating a network loads no torch.
+_PUBLIC = {
+    "Features": "networks",
+    "Network": "networks",
+    "NetworkPolicy": "networks",
+    "load_checkpoint": "checkpoints",
+    "save_checkpoint": "checkpoints",
+}
+
+__all__ = ["Features", "Network", "NetworkPolicy", "load_checkpoint", "save_checkpoint"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _PUBLIC:
+        return getattr(import_module(f".{_PUBLIC[name]}", __name__), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

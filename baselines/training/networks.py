@@ -1,0 +1,248 @@
+"""Networks as values: what they see of an observation, their layers, what their outputs command.
+
+Inference is numpy alone, so that a shipped policy needs no torch. Training frameworks export to `Network`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quad_envs.agent_observations import AgentLayout
+from quad_envs.observations import N_REFERENCE, TrackingLayout
+from quad_envs.tasks import BaseTask, Task, TeamTask
+
+from ..policy import N_FALLBACKS, Actions, PolicyState
+
+Floats = NDArray[np.float32]
+Squash = Literal["tanh", "clip"]
+Commands = Literal["hover", "action"]
+
+# Preview stages that a network sees: near ones densely, the horizon of the MPCs at the end.
+TRACKING_STAGES = (0, 1, 2, 3, 5, 7, 10, 14, 19, 25)
+# Typical size of each part, so that a network sees numbers of order one.
+_SCALES = {
+    "V_B": 3.0,
+    "phi_theta": 0.5,
+    "sin_cos_psi": 1.0,
+    "Omega": 3.0,
+    "F": 2.0,
+    "last_command": 2.0,
+    "position": 2.0,
+    "disturbance": 0.5,
+    "role": 1.0,
+    "slot": 2.0,
+}
+_ROW_SCALES = {
+    "preview": (2.0, 2.0, 2.0, 3.0, 3.0, 3.0, 1.0, 1.0),
+    "sensed": (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0),
+    "measured": (1.0, 5.0, 1.0, 1.0, 1.0),
+    "estimate": (1.0, 2.0, 2.0, 2.0, 1.0, 1.0, 1.0, *(1.0,) * 6),
+    "comm": (10.0, 1.0, *(2.0,) * 3, *(1.0,) * 3, 0.5, 0.5, 1.0, 1.0, *(2.0,) * 3, *(2.0,) * 6),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """Which entries of an observation a network sees, and how they are scaled: (obs - mean) / scale.
+
+    The entries are named, so that a network for 25 preview stages can fly where there are 30.
+    """
+
+    names: tuple[str, ...]  # "V_B[0]", "preview[5][2]", ...: part, then index in the part
+    mean: tuple[float, ...]
+    scale: tuple[float, ...]
+
+    def columns(self, layout: TrackingLayout | AgentLayout) -> NDArray[np.int64]:
+        """Indices in an observation of this layout.
+
+        Raises:
+            ValueError: If the layout lacks an entry; the message names it.
+        """
+        known = {name: k for k, name in enumerate(entry_names(layout))}
+        missing = [name for name in self.names if name not in known]
+        if missing:
+            raise ValueError(
+                f"the network sees {missing[0]} (and {len(missing) - 1} more), which observations of this task "
+                "lack: evaluate it in a task with the layout it was trained on (preview, limits, slots)"
+            )
+        return np.array([known[name] for name in self.names], dtype=np.int64)
+
+
+def part_shapes(layout: TrackingLayout | AgentLayout) -> dict[str, tuple[int, ...]]:
+    """Name -> shape of the parts of an observation, in their order."""
+    if isinstance(layout, AgentLayout):
+        return layout.shapes
+    sizes = {name: part.stop - part.start for name, part in layout.slices.items() if name != "own"}
+    return {
+        name: (size // N_REFERENCE, N_REFERENCE) if name == "preview" else (size,)
+        for name, size in sizes.items()
+    }
+
+
+def entry_names(layout: TrackingLayout | AgentLayout) -> list[str]:
+    """A name for each entry of an observation."""
+    return [
+        name + "".join(f"[{i}]" for i in index)
+        for name, shape in part_shapes(layout).items()
+        for index in np.ndindex(*shape)
+    ]
+
+
+def default_features(layout: TrackingLayout | AgentLayout, stages: tuple[int, ...] | None = None) -> Features:
+    """Everything but some preview stages, scaled to order one.
+
+    Args:
+        layout: Of the task.
+        stages: Preview stages to keep; None for `TRACKING_STAGES` as far as they go.
+    """
+    if stages is None:
+        stages = TRACKING_STAGES
+    names, scale = [], []
+    for name, shape in part_shapes(layout).items():
+        row = _ROW_SCALES.get(name, (_SCALES.get(name, 1.0),))
+        for index in np.ndindex(*shape):
+            if name == "preview" and index[0] not in stages:
+                continue
+            names.append(name + "".join(f"[{i}]" for i in index))
+            scale.append(row[index[-1] % len(row)])
+    mean = [1.96 if name.startswith(("F[", "last_command[")) else 0.0 for name in names]
+    return Features(tuple(names), tuple(mean), tuple(scale))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Network:
+    """Tanh layers over features, a linear layer, and what its outputs command.
+
+    Raises:
+        ValueError: If the shapes do not fit together or a number is not finite.
+    """
+
+    features: Features
+    weights: tuple[Floats, ...]  # each (inputs, outputs)
+    biases: tuple[Floats, ...]  # each (outputs,)
+    squash: Squash = "tanh"  # how outputs come into [-1, 1]
+    commands: Commands = "hover"  # "hover": outputs are u_T (1 + output); "action": they are the actions
+
+    def __post_init__(self) -> None:
+        for name, kind in (("squash", Squash), ("commands", Commands)):
+            if getattr(self, name) not in get_args(kind):
+                allowed = " or ".join(map(repr, get_args(kind)))
+                raise ValueError(f"{name} of a network must be {allowed}, got {getattr(self, name)!r}")
+        if not self.weights or len(self.weights) != len(self.biases):
+            raise ValueError(
+                f"a network needs as many weights as biases, got {len(self.weights)} and {len(self.biases)}"
+            )
+        n = len(self.features.names)
+        if not len(self.features.mean) == len(self.features.scale) == n:
+            raise ValueError("features of a network need a mean and a scale for each name")
+        for k, (W, b) in enumerate(zip(self.weights, self.biases, strict=True)):
+            if W.ndim != 2 or W.shape[0] != n or b.shape != W.shape[1:]:
+                raise ValueError(
+                    f"layer {k} of a network must take {n} inputs, got weights {W.shape} and bias {b.shape}"
+                )
+            if W.dtype != np.float32 or b.dtype != np.float32:
+                raise ValueError(f"layer {k} of a network must be float32, got {W.dtype} and {b.dtype}")
+            if not (np.isfinite(W).all() and np.isfinite(b).all()):
+                raise ValueError(f"layer {k} of a network is not finite")
+            n = W.shape[1]
+        if not min(self.features.scale, default=1.0) > 0.0:
+            raise ValueError("scales of a network's features must be > 0")
+
+    @property
+    def outputs(self) -> int:
+        """Numbers that it gives."""
+        return int(self.weights[-1].shape[1])
+
+
+def hover_actions(outputs: Floats, task: BaseTask) -> Floats:
+    """Actions that command u_T (1 + output) within the rotor box, for the first four outputs.
+
+    Outputs in [-1, 1] span 0 to m g / 2 per rotor: learning is faster than on the environments' own map,
+    whose upper half reaches to kappa m g.
+    """
+    out = outputs.copy()
+    gain = task.hover_force / (task.force_max - task.hover_force)
+    rotors = out[..., :4]
+    np.copyto(rotors, np.minimum(np.where(rotors < 0.0, rotors, gain * rotors), 1.0))
+    return out
+
+
+class NetworkPolicy:
+    """A network as a policy; it remembers nothing.
+
+    Args:
+        network: Its layers.
+        task: Where it flies.
+        name: For tables.
+        kind: What it knows: "model-free", "imitation" or "model-based".
+
+    Raises:
+        ValueError: If the task's observations lack what the network sees, or its actions have another size.
+    """
+
+    def __init__(self, network: Network, task: BaseTask, name: str, kind: str = "") -> None:
+        if not isinstance(task, Task | TeamTask):
+            raise ValueError(f"a network needs a Task or a TeamTask, got {task!r}")
+        size = task.action_size if isinstance(task, TeamTask) else 4
+        if network.outputs != size:
+            raise ValueError(
+                f"the network gives {network.outputs} numbers, an action of this task has {size}"
+            )
+        if network.commands == "hover" and size == 6:
+            raise ValueError("actions of this task are estimates: a network needs commands='action'")
+        self.network, self.task, self.name, self.kind = network, task, name, kind
+        self._size = task.layout.size
+        self._columns = network.features.columns(task.layout)
+        # Scaling is a part of the first layer.
+        scale = np.asarray(network.features.scale, dtype=np.float64)
+        mean = np.asarray(network.features.mean, dtype=np.float64)
+        W = network.weights[0] / scale[:, None]
+        first = W.astype(np.float32), (network.biases[0] - mean @ W).astype(np.float32)
+        self._layers = [first, *zip(network.weights[1:], network.biases[1:], strict=True)]
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.name!r}, {self.task.env_id!r})"
+
+    def predict(
+        self,
+        observation: NDArray[Any],
+        state: PolicyState | None = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Actions, PolicyState]:
+        """Choose actions; see `Policy`.
+
+        Raises:
+            ValueError: If a shape is wrong or an observation is not finite.
+        """
+        obs = np.asarray(observation, dtype=np.float32)
+        one = obs.ndim == 1
+        if one:
+            obs = obs[None]
+        if obs.ndim != 2 or obs.shape[1] != self._size:
+            shape = np.shape(observation)
+            raise ValueError(f"observation must have shape (n, {self._size}) or ({self._size},), got {shape}")
+        x = obs[:, self._columns]
+        if not np.isfinite(x).all():
+            row, column = np.argwhere(~np.isfinite(x))[0]
+            name = self.network.features.names[column]
+            raise ValueError(
+                f"observation {row} is not finite: {name} is {x[row, column]}; check the sensors"
+            )
+        for k, (W, b) in enumerate(self._layers):
+            x = x @ W + b
+            if k + 1 < len(self._layers) or self.network.squash == "tanh":
+                np.tanh(x, out=x)
+        x = np.clip(x, -1.0, 1.0)
+        actions = hover_actions(x, self.task) if self.network.commands == "hover" else x
+        return actions[0] if one else actions, _no_state(len(obs))
+
+
+def _no_state(n: int) -> PolicyState:
+    """The state of a policy that remembers nothing: no fallbacks, no iterations."""
+    count = np.zeros(n, dtype=np.int64)
+    return PolicyState(np.zeros((n, 0)), np.zeros((n, N_FALLBACKS), dtype=np.int64), count, count)
