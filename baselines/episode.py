@@ -13,7 +13,7 @@ from quad_envs.parameters import Array
 from quad_envs.tasks import BaseTask, TeamTask
 
 from .policy import N_FALLBACKS, Actions, Counts, PolicyState
-from .team_signals import TEAM_INFO, estimate_signals
+from .team_signals import TEAM_INFO, WRAPPER_INFO, estimate_signals
 
 SCORES = ("stage_cost", "cost", "constraint_violation")
 INFO = (*SCORES, "constraint_values", "crashed")  # keys that every environment of the suite tells
@@ -119,6 +119,8 @@ class Recorder:
         if self.targets is not None and isinstance(self.task, TeamTask):
             truth = self.targets[:, len(self.steps) - 1]
             told |= estimate_signals(self.task, state, observations, actions, self.plants[-1], truth)
+            if "nis" in info and "nis" in told and np.isnan(told["nis"]).all():
+                told |= {key: info[key] for key in WRAPPER_INFO}
         for name, values in told.items():
             self.signals.setdefault(name, []).append(np.array(values))
         self.plants.append(plants)

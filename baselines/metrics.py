@@ -73,7 +73,7 @@ class Record(NamedTuple):
     estimate_sigma: float = _NAN  # m, sqrt(mean trace P) of that position, as the policy believes
     anees: float = _NAN  # -, mean of e' P^-1 e of that position / 3; 1 for an honest filter
     nis_ratio: float = _NAN  # -, mean of NIS / rows over the updates; 1 for an honest filter
-    trilateration_share: float = _NAN  # -, updates that entered as a trilaterated position
+    trilateration_share: float = _NAN  # -, updates as a trilaterated position; nan if none was
 
     def row(self) -> dict[str, Any]:
         """Flat form for tables: `worst_violation` becomes one column per constraint."""

@@ -5,13 +5,15 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_envs.names import unknown_name
-from quad_envs.tasks import BaseTask, Task, TeamTask
+
+if TYPE_CHECKING:  # not at run time: tasks load numba, and `quad-envs list` has to be quick
+    from quad_envs.tasks import BaseTask, Task, TeamTask
 
 Actions = NDArray[np.float32]
 Counts = NDArray[np.int64]
@@ -152,7 +154,7 @@ TEAM_POLICIES: dict[str, PolicyEntry] = {
 
 def mission_of(task: BaseTask) -> str:
     """What policies of a task do: "tracking", "formation", "target-tracking" or "estimation"."""
-    return task.mission if isinstance(task, TeamTask) else "tracking"
+    return str(getattr(task, "mission", "tracking"))
 
 
 def serving(mission: str) -> dict[str, PolicyEntry]:
@@ -239,9 +241,9 @@ def make_policy(name: str, env: Any, **options: Any) -> Policy:
         _check_kind(name, option, options[option], defaults[option])
     task: BaseTask = task_of(env)
     factory = _factory(policy_entry(name, mission_of(task)))
-    if isinstance(task, TeamTask):
-        return _make_team_policy(name, factory, task, defaults, options)
-    return _make_tracking_policy(name, factory, cast(Task, task), defaults, options)
+    if mission_of(task) in TEAM_MISSIONS:
+        return _make_team_policy(name, factory, cast("TeamTask", task), defaults, options)
+    return _make_tracking_policy(name, factory, cast("Task", task), defaults, options)
 
 
 def _built(name: str, factory: Callable[..., Any], task: BaseTask, options: Mapping[str, Any]) -> Any:

@@ -22,10 +22,11 @@ from quad_envs.tasks import BaseTask, TeamTask
 from .environments import is_parallel, require_own_task
 from .episode import INFO, Episode, Recorder, Said
 from .policy import Policy
-from .team_signals import TEAM_INFO
+from .team_signals import TEAM_INFO, WRAPPER_INFO
 
 __all__ = ["Episode", "is_privileged", "run_episodes"]
 
+_KEPT = (*INFO, *TEAM_INFO, *WRAPPER_INFO)
 _WARM_UP_CALLS = 2  # the first compiles, the second takes the path with a state
 
 
@@ -181,7 +182,7 @@ def _stack_step(names: Sequence[str], parts: Sequence[Mapping[str, Any]], last: 
     told = []
     for j, name in enumerate(names):
         if name in rewards:
-            info = {key: infos[name][key] for key in (*INFO, *TEAM_INFO) if key in infos[name]}
+            info = {key: infos[name][key] for key in _KEPT if key in infos[name]}
             told.append((rewards[name], terminated[name], truncated[name], info))
         elif last is not None:
             info = {key: values[j] for key, values in last.info.items()}

@@ -104,7 +104,7 @@ def _estimates(episode: Episode) -> dict[str, float]:
         found["anees"] = anees(error[given], P[given])
     if updated.any():
         found["nis_ratio"] = float((nis[updated] / rows[updated]).mean())
-    if "trilaterated" in signals:
+    if "trilaterated" in signals and signals["trilaterated"].any():
         found["trilateration_share"] = float(signals["trilaterated"].mean())
     return found
 

@@ -9,7 +9,9 @@
 | estimate_error | (T, 6) | estimated minus true [r, v] of the target when the policy decided, m and m/s |
 | estimate_covariance | (T, 6, 6) | what the policy gives as its covariance; nan where it gives none |
 | trilaterated | (T,) | whether the measurements entered as a trilaterated position |
-| nis, nis_rows | (T,) | normalised innovation squared of the last update, and the numbers in it |
+| nis, nis_rows | (T,) | normalised innovation squared of an update, and the numbers in it |
+
+An update belongs to the decision of its step; that of the estimate wrapper comes with the step's answer.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from .policy import Estimates, PolicyState
 
 # Keys of `info` that become signals under the same names.
 TEAM_INFO = ("formation_error", "min_separation", "messages", "reward_terms")
+WRAPPER_INFO = ("nis", "nis_rows")  # of the estimate wrapper's filter, where the policy has none of its own
 _VECH = (np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2]))  # xx, xy, xz, yy, yz, zz
 
 

@@ -17,8 +17,8 @@ import pytest
 from baselines.__main__ import COMMANDS, main
 from baselines.commands import _resume
 from baselines.options import BenchmarkOptions, read_assignments
-from baselines.policy import TRACKING_POLICIES
-from quad_envs.registration import TRACKING
+from baselines.policy import TEAM_POLICIES, TRACKING_POLICIES
+from quad_envs.registration import TEAMS, TRACKING
 
 HELIX = "quad/HelixTracking-v0"
 RUN = [sys.executable, "-m", "baselines"]
@@ -121,6 +121,10 @@ def test_evaluate_discards_another_run_if_asked_to(capsys, tmp_path):
         (["benchmark", "quik"], "unknown suite 'quik'; did you mean 'quick'"),
         (["benchmark", "quick", "--engine", "processe"], "did you mean 'processes'"),
         (["list", "hovr"], "did you mean 'hover'"),
+        (["evaluate", "quad/Formation", "hover"], "did you mean 'quad/Formation-v0'"),
+        (["evaluate", "quad/Formation-v0", "hover", "--set", "grph=weak"], "did you mean 'graph'"),
+        (["evaluate", "quad/Formation-v0", "lmpc"], "for tracking tasks, not for formation"),
+        (["evaluate", HELIX, "consensus-mpc"], "for formation tasks, not for tracking"),
         (["evaluate", HELIX, "hover", "--set", "reference=nofile.csv"], "nofile.csv"),
         (["evaluate", HELIX, "hover", "--seed", "-1"], "seed must be a whole number >= 0, got -1"),
         (["evaluate", "CartPole-v1", "hover"], "one of the ids quad/Regulation-v0"),
@@ -170,9 +174,10 @@ def test_list_names_every_environment_and_policy(capsys):
     assert main(["list", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert set(found["environments"]) == set(TRACKING) and set(found["policies"]) == set(TRACKING_POLICIES)
+    assert set(found["team_environments"]) == set(TEAMS) and set(found["team_policies"]) == set(TEAM_POLICIES)
     assert main(["list"]) == 0
     printed = capsys.readouterr().out
-    assert all(name in printed for name in (*TRACKING, *TRACKING_POLICIES))
+    assert all(name in printed for name in (*TRACKING, *TEAMS, *TRACKING_POLICIES, *TEAM_POLICIES))
 
 
 @pytest.mark.parametrize(("name", "option"), [(HELIX, "reference"), ("random", "seed")])
@@ -234,7 +239,7 @@ def test_ctrl_c_says_how_to_resume_and_exits_with_130(tmp_path):
 def test_doctor_examines_the_installation(capsys):
     assert main(["doctor", "--json"]) == 0
     findings = {finding["check"]: finding for finding in json.loads(capsys.readouterr().out)}
-    assert set(findings) == {"versions", "packages", "cache", "self-test", "extras"}
+    assert set(findings) == {"versions", "packages", "cache", "self-test", "team-test", "extras"}
     assert all(finding["ok"] for finding in findings.values())
     assert Path(findings["cache"]["detail"]).is_absolute()
 

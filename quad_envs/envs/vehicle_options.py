@@ -84,6 +84,7 @@ class VehicleOptions:
         if self.reward not in ("bounded", "quadratic"):
             raise ValueError(f"reward must be 'bounded' or 'quadratic', got {self.reward!r}")
         # Build what can be built, so that a bad value is refused here and not at the first reset.
+        self.make_limits()
         self.randomization()
         self.noise_deviations()
         make_disturbance(self.disturbance)
