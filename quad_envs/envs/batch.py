@@ -69,13 +69,13 @@ class TrackingBatch:
         if self._disturbance is not None and not random[1]:
             self.disturbances[0] = disturbance_rows(self._disturbance, self._nodes, dt, never)
         self._random = random
-        self._which: NDArray[np.int64] = np.zeros((3, n), dtype=np.int64)
+        self.which: NDArray[np.int64] = np.zeros((3, n), dtype=np.int64)
         for table in range(3):
             if random[table]:
-                self._which[table] = np.arange(n)
+                self.which[table] = np.arange(n)
         self._scratch = np.zeros(SCRATCH_SIZE)
         # What the step kernel takes before the actions and between them and the observations.
-        self._before = (self.rows, self.references, self.disturbances, self.noises, self._which)
+        self._before = (self.rows, self.references, self.disturbances, self.noises, self.which)
         self._after = (self._vector, self._scratch, np.zeros(n, dtype=np.int64))
 
     def reset_row(
@@ -113,13 +113,13 @@ class TrackingBatch:
         if self._random[2]:
             rng.standard_normal(out=self.noises[i])
             self.noises[i] *= self._noise
-        distance = float(np.linalg.norm(row[POSITION] - self.references[self._which[0, i], 0, POSITION]))
+        distance = float(np.linalg.norm(row[POSITION] - self.references[self.which[0, i], 0, POSITION]))
         if distance > self.options.lost_distance:
             raise ValueError(
                 f"the start is {distance:.3g} m from the reference, beyond lost_distance = "
                 f"{self.options.lost_distance:g} m; move the start or the reference, or raise lost_distance"
             )
-        begin_row(self.rows, i, self.references[self._which[0, i]], self._vector)
+        begin_row(self.rows, i, self.references[self.which[0, i]], self._vector)
         self.observe(i, out)
 
     def observe(self, i: int, out: NDArray[np.float32]) -> None:
@@ -130,11 +130,15 @@ class TrackingBatch:
             self.references,
             self.disturbances,
             self.noises,
-            self._which,
+            self.which,
             self._vector,
             self._scratch,
             out,
         )
+
+    def reference(self, i: int) -> Array:
+        """Reference rows of flight i in its present episode, a view, (n_steps, 8)."""
+        return np.asarray(self.references[self.which[0, i]])
 
     def step(self, actions: NDArray[np.floating], out: NDArray[np.float32]) -> None:
         """Move all flights by one control period and write their observations.

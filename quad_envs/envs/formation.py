@@ -56,6 +56,9 @@ class FormationEnv(TeamEnv):
     Task: `reference` of the leader ("line", "setpoint", "fast-line", "slow-helix", any of the suite's),
         `preview` 5 stages of it, `formation_weight` w 1, `time_limit` 20 s or `max_cycles` steps.
 
+    Rendering: `render_mode` None, "rgb_array" or "human" (a window, needs `quad-envs[human]`), `render_size`
+        (640, 480) pixels.
+
     ## References
     G. Ru, Nonlinear Model Predictive Control for Cooperative Control and Estimation, 2017, chapter 5.
     """

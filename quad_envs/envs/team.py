@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import numpy as np
-from gymnasium import spaces
+from gymnasium import logger, spaces
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
@@ -26,6 +26,7 @@ from .kernel import (
     VALUES,
     VIOLATED,
 )
+from .pictures import NO_RENDERING, TeamPictures, checked_rendering
 from .team_batch import TeamBatch
 from .team_kernel import N_LOSS
 from .team_options import TeamOptions
@@ -44,13 +45,20 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
 
     options_type: ClassVar[type[TeamOptions]] = TeamOptions
 
-    def __init__(self, render_mode: str | None = None, **kwargs: Any) -> None:
-        if render_mode is not None:
-            raise ValueError(f"render_mode must be None, got {render_mode!r}")
-        self.metadata = {"render_modes": [], "name": self.options_type.mission, "is_parallelizable": True}
+    def __init__(
+        self, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480), **kwargs: Any
+    ) -> None:
+        picture_size = checked_rendering(render_mode, ("human", "rgb_array"), render_size)
+        self.metadata = {
+            "render_modes": ["human", "rgb_array"],
+            "render_fps": 20,
+            "name": self.options_type.mission,
+            "is_parallelizable": True,
+        }
         self.render_mode = render_mode
         options = self.options_type.from_kwargs(kwargs)
         self._batch = TeamBatch(options, 1)
+        self._pictures = TeamPictures(self._batch, picture_size, render_mode) if render_mode else None
         self.possible_agents = [f"quad_{i}" for i in range(options.vehicles)]
         self.agents: list[str] = []
         self.max_cycles = self.task.episode_steps
@@ -104,14 +112,7 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
     @property
     def state_slices(self) -> dict[str, slice]:
         """Name -> slice of `state()`: plants, target, graph, preview, time."""
-        n, stages = self.task.vehicles, self.task.layout.preview + 1
-        out, start = {}, 0
-        for name, size in (
-            *(("plants", 16 * n), ("target", 6), ("graph", n * n), ("preview", 8 * stages), ("time", 1)),
-        ):
-            out[name] = slice(start, start + size)
-            start += size
-        return out
+        return self.task.state_slices
 
     def state(self) -> Array:
         """The whole truth for centralised critics, parts as in `state_slices`, absolute, float64.
@@ -133,6 +134,8 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
             self.np_random, _ = seeding.np_random(seed)
         observations = self._fresh_observations()
         self._batch.reset_team(0, self.np_random, observations, options)
+        if self._pictures:
+            self._pictures.record()
         self.agents = self.possible_agents.copy()
         self._rows = np.arange(len(self.agents))
         return dict(zip(self.agents, observations, strict=True)), self._infos()
@@ -143,7 +146,10 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
         """Hold the rotor commands of all agents over one control period."""
         agents = self.agents
         observations = self._fresh_observations()
-        self._batch.step(self._stack(actions), observations)
+        stacked = self._stack(actions)
+        self._batch.step(stacked, observations)
+        if self._pictures:
+            self._pictures.record(stacked)
         rows, which = self._batch.rows, self._rows
         if len(which) < len(rows):
             rows, observations = rows[which], observations[which]
@@ -160,6 +166,18 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
             self._rows = which[~done]
             self.agents = [self.possible_agents[i] for i in self._rows]
         return answer
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """The picture of the present moment, (height, width, 3); with "human" it is in the window already."""
+        if self._pictures is None:
+            logger.warn(NO_RENDERING)
+            return None
+        return self._pictures.show()
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._pictures:
+            self._pictures.close()
 
     def _fresh_observations(self) -> Observation:
         return np.empty(self._shape, dtype=np.float32)

@@ -198,6 +198,10 @@ class TeamBatch:
         """Weights G at step k, (N, N)."""
         return np.asarray(self.graphs.graphs[self.graphs.which[k]])
 
+    def heard(self, t: int) -> Array:
+        """Weight, sent, received of the last message in each comm slot of team t, a view, (N, K, 3)."""
+        return self._messages[t * self.n : (t + 1) * self.n, :, :HEAD]
+
     def step(self, actions: NDArray[np.floating], out: NDArray[np.float32]) -> None:
         """Move all teams by one control period and write their observations.
 

@@ -14,6 +14,7 @@ from ..tasks import Task
 from .batch import TrackingBatch
 from .kernel import PLANT, SCORES, VALUES
 from .options import TrackingOptions
+from .pictures import NO_RENDERING, TrackingPictures, checked_rendering
 
 Observation = NDArray[np.float32]
 
@@ -74,17 +75,22 @@ class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         attitude rad, rates rad/s, or one number for all), `randomize` (relative spread of mass, inertia, arm,
         kappa, rotor_rate, drag at reset: a mapping or one number for all).
 
+    Rendering: `render_mode` None or "rgb_array" (`gymnasium.make` makes "human" of it), `render_size`
+        (640, 480) pixels.
+
     ## References
     G. Ru, Nonlinear Model Predictive Control for Cooperative Control and Estimation, 2017, chapters 2 to 4.
     """
 
-    metadata = {"render_modes": [], "render_fps": 20}  # noqa: RUF012 (Gymnasium's own form)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 (Gymnasium's own form)
 
-    def __init__(self, render_mode: str | None = None, **kwargs: Any) -> None:
-        if render_mode is not None:
-            raise ValueError(f"render_mode must be None, got {render_mode!r}")
+    def __init__(
+        self, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480), **kwargs: Any
+    ) -> None:
+        size = checked_rendering(render_mode, ("rgb_array",), render_size)
         self.render_mode = render_mode
         self._batch = TrackingBatch(TrackingOptions.from_kwargs(kwargs), 1)
+        self._pictures = TrackingPictures(self._batch, 0, size) if render_mode else None
         self._bind()
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.observation_space = spaces.Box(-np.inf, np.inf, (self._size,), np.float32)
@@ -126,6 +132,8 @@ class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         super().reset(seed=seed)
         observation = np.empty(self._size, dtype=np.float32)
         self._batch.reset_row(0, self.np_random, observation, options)
+        if self._pictures:
+            self._pictures.record()
         return observation, self._info(self._scores.tolist())
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -137,6 +145,8 @@ class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             raise ValueError(f"action must have shape (4,), one entry per rotor, got {actions.shape}")
         observation = np.empty(self._size, dtype=np.float32)
         self._batch.step(actions, observation)
+        if self._pictures:
+            self._pictures.record()
         scores = self._scores.tolist()
         return (
             observation,
@@ -145,6 +155,13 @@ class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             scores[_TRUNCATED] > 0.0,
             self._info(scores),
         )
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """The picture of the present moment, (height, width, 3), with `render_mode="rgb_array"`."""
+        if self._pictures is None:
+            gymnasium.logger.warn(NO_RENDERING)
+            return None
+        return self._pictures.frame()
 
     def _info(self, scores: list[float]) -> dict[str, Any]:
         return {

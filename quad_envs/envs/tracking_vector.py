@@ -29,6 +29,7 @@ from .kernel import (
     VIOLATED,
 )
 from .options import TrackingOptions
+from .pictures import NO_RENDERING, TrackingPictures, checked_rendering
 
 Observations = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -42,7 +43,8 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.floa
         num_envs: Number of flights.
         autoreset_mode: Gymnasium's NEXT_STEP (default), SAME_STEP or DISABLED.
         max_episode_steps: From `gymnasium.make_vec`; shortens the task's time limit.
-        render_mode: None.
+        render_mode: None or "rgb_array".
+        render_size: Width and height of each picture, pixels.
         kwargs: As for `TrackingEnv`.
 
     Raises:
@@ -56,20 +58,26 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.floa
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
+        render_size: tuple[int, int] = (640, 480),
         **kwargs: Any,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be >= 1, got {num_envs!r}")
-        if render_mode is not None:
-            raise ValueError(f"render_mode must be None, got {render_mode!r}")
+        size = checked_rendering(render_mode, ("rgb_array",), render_size)
         options = TrackingOptions.from_kwargs(kwargs)
         if max_episode_steps is not None:
             limit = min(options.time_limit, max_episode_steps * options.dt)
             options = TrackingOptions.from_kwargs({**kwargs, "time_limit": limit})
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.metadata = {"render_modes": [], "render_fps": 20, "autoreset_mode": self.autoreset_mode}
+        self.metadata = {
+            "render_modes": ["rgb_array"],
+            "render_fps": 20,
+            "autoreset_mode": self.autoreset_mode,
+        }
         self._batch = TrackingBatch(options, num_envs)
+        shown = range(num_envs) if render_mode else range(0)
+        self._pictures = [TrackingPictures(self._batch, i, size) for i in shown]
         self._n_values = len(self.task.constraint_names)
         self.single_action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (self.task.layout.size,), np.float32)
@@ -119,6 +127,9 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.floa
             else:
                 self._batch.observe(i, observations[i])
         self._done[mask] = False
+        for i, pictures in enumerate(self._pictures):
+            if mask[i]:
+                pictures.record()
         return observations, self._info()
 
     def step(self, actions: NDArray[np.float32]) -> _Step:
@@ -144,7 +155,16 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.floa
         info = self._info()
         if self.autoreset_mode is AutoresetMode.SAME_STEP and self._done.any():
             info = self._reset_in_same_step(observations, info)
+        for pictures in self._pictures:
+            pictures.record()
         return observations, rewards, terminated, truncated, info
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """One picture of each flight, (height, width, 3), with `render_mode="rgb_array"`."""
+        if not self._pictures:
+            gymnasium.logger.warn(NO_RENDERING)
+            return None
+        return tuple(pictures.frame() for pictures in self._pictures)
 
     def _given_states(self, state: Any) -> Array | None:
         """Start states from the reset options, one row per flight."""

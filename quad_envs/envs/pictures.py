@@ -1,0 +1,303 @@
+"""What the environments tell of their flights for pictures: trails, scores, a Scene of the present moment.
+
+An environment has one of these only if it was given a render_mode; without one nothing is recorded.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from ..constraints import TOLERANCE
+from ..parameters import POSITION, VELOCITY, Array
+from ..scenes import Framing, Scene
+from ..tasks import BaseTask
+from ..window import Window
+from .batch import TrackingBatch
+from .exchange import ALIVE, MEASURES, NEAREST, SENT, SLOT_ERROR, WEIGHT
+from .kernel import CRASHED, PLANT, REWARD, STEP, TRUNCATED, VALUES, VIOLATED
+from .team_batch import TeamBatch
+from .team_kernel import ESTIMATE_REACH, ESTIMATE_SPEED
+from .team_options import EstimationOptions
+
+_TRAIL = 3.0  # s
+_UNITS = {"tilt": "rad", "velocity": "m/s", "position": "m", "rate": "N", "separation": "m"}
+_OVERVIEW_POINTS = 120
+
+
+NO_RENDERING = 'there are no pictures without a render_mode: make the environment with "rgb_array"'
+_SMALLEST, _LARGEST = 160, 4096  # pixels
+
+
+def checked_rendering(mode: str | None, known: tuple[str, ...], render_size: Any) -> tuple[int, int]:
+    """Width and height of pictures.
+
+    Raises:
+        ValueError: If the mode is unknown, or the size is not a pair of whole numbers that suits the text.
+    """
+    if mode is not None and mode not in known:
+        remedy = ""
+        if mode == "human":
+            remedy = '; gymnasium.make(..., render_mode="human") or its HumanRendering wrapper opens a window'
+        raise ValueError(f"render_mode must be None or {' or '.join(map(repr, known))}, got {mode!r}{remedy}")
+    pair = tuple(render_size) if isinstance(render_size, tuple | list) else ()
+    whole = all(isinstance(n, int | np.integer) and not isinstance(n, bool) for n in pair)
+    if len(pair) != 2 or not whole or not all(_SMALLEST <= n <= _LARGEST for n in pair):
+        raise ValueError(
+            f"render_size must be (width, height) in pixels, whole numbers from {_SMALLEST} to {_LARGEST}, "
+            f"got {render_size!r}"
+        )
+    return int(pair[0]), int(pair[1])
+
+
+class Pictures:
+    """Records one flight and shows it.
+
+    Args:
+        task: The task.
+        rows: Rows of its vehicles in the batch, a view, (n, row size).
+        size: Width and height of the pictures, pixels.
+    """
+
+    def __init__(self, task: BaseTask, rows: Array, size: tuple[int, int]) -> None:
+        self.size = size
+        self._task, self._rows = task, rows
+        self._trail: deque[Array] = deque(maxlen=max(2, round(_TRAIL / task.dt) + 1))
+        self._rewards = 0.0
+        self._wanted = np.zeros((0, 0, 3))
+        self._target = np.zeros((0, 3))
+        self._estimates = np.zeros((0, 3))  # of the target's position, where those are the actions
+        self._framing: Framing | None = None
+        limits = task.limits
+        self._box = np.array([limits.position_lower, limits.position_upper])
+        if not limits.has_position:
+            self._box = self._box[:0]
+
+    def record(self, actions: NDArray[np.float32] | None = None) -> None:
+        """Take the present moment down, and the actions that led there; a reset begins anew."""
+        if self._rows[0, STEP] == 0.0:
+            self._trail.clear()
+            self._rewards, self._estimates = 0.0, self._estimates[:0]
+            self._wanted, self._target = self._wishes()
+            seen = np.concatenate([self._wanted, self._target[None]]) if len(self._target) else self._wanted
+            self._framing = Framing(seen, self._box, self._task.dt)
+        else:
+            self._rewards += float(self._rows[:, REWARD].mean())
+        self._trail.append(self._rows[:, PLANT][:, POSITION].copy())
+
+    def frame(self) -> NDArray[np.uint8]:
+        """The picture of the present moment, (height, width, 3).
+
+        Raises:
+            ResetNeeded: If no episode has begun.
+        """
+        from ..rendering import render
+
+        return render(self.scene(), *self.size)
+
+    def scene(self) -> Scene:
+        """The present moment.
+
+        Raises:
+            ResetNeeded: If no episode has begun.
+        """
+        if self._framing is None:
+            raise gymnasium.error.ResetNeeded("call reset() before render()")
+        rows, task, k = self._rows, self._task, int(self._rows[0, STEP])
+        sound = np.isfinite(rows[:, PLANT]).all(axis=1)
+        flies = sound & self._alive()
+        who, plants = np.flatnonzero(flies), rows[flies, PLANT]
+        values = rows[flies, VALUES : VALUES + len(task.constraint_names)]
+        names = task.constraint_names
+        aim = self._target[max(0, k + 2 - len(self._trail)) : k + 1]
+        path, links = self._path(), self._links(who)
+        leader = np.flatnonzero(who == self._leader())
+        return Scene(
+            title=task.env_id.removeprefix("quad/"),
+            lines=self._lines(k),
+            limits=_limit_texts(names, values),
+            ended=self._ending(),
+            plants=plants,
+            numbers=tuple(who.tolist()),
+            leader=int(leader[0]) if leader.size else -1,
+            violated=rows[flies, VIOLATED] > 0.0,
+            crowded=_too_near(names, values),
+            trails=np.array(self._trail)[:, flies],
+            wrecks=rows[~flies & sound, PLANT][:, POSITION],
+            behind=path[max(0, k - round(2.0 * _TRAIL / task.dt)) : k + 1],
+            ahead=path[k:],
+            slots=self._wanted[flies[: len(self._wanted)], min(k, self._wanted.shape[1] - 1)],
+            overview=path[:: max(1, len(path) // _OVERVIEW_POINTS)] if self._framing.follows else path[:0],
+            target=aim,
+            estimates=self._estimates[flies[: len(self._estimates)]],
+            sights=self._sights()[flies],
+            links=links[:, :2].astype(np.int64),
+            strength=links[:, 2:],
+            box=self._box,
+            view=self._framing.view(k, np.concatenate([plants[:, POSITION], aim[-1:]])),
+            ground=self._framing.ground(k),
+            arm=task.params.arm,
+            separation=float(getattr(task, "separation", 0.0)),
+            forces=(task.hover_force, task.force_max),
+        )
+
+    def _lines(self, k: int) -> tuple[str, ...]:
+        """Time and score: the mean reward so far, and of a whole episode once it is over."""
+        task = self._task
+        score = f"score {self._rewards / (task.episode_steps if self._ending() else max(k, 1)):.3f}"
+        return (
+            f"t {k * task.dt:.2f} / {task.episode_steps * task.dt:g} s",
+            score if task.reward == "bounded" else f"return {self._rewards:.1f}",
+        )
+
+    def _ending(self) -> str:
+        if (self._rows[:, CRASHED] > 0.0).all():
+            return "crashed"
+        return "time limit" if (self._rows[:, TRUNCATED] > 0.0).any() else ""
+
+    def _wishes(self) -> tuple[Array, Array]:
+        """Wanted positions (n, T+1, 3) and the target's (T+1, 3), no rows where there is none."""
+        raise NotImplementedError
+
+    def _path(self) -> Array:
+        """The reference to draw, (T+1, 3) or no rows."""
+        return np.asarray(self._wanted[0])
+
+    def _alive(self) -> NDArray[np.bool_]:
+        return np.ones(len(self._rows), dtype=np.bool_)
+
+    def _sights(self) -> NDArray[np.bool_]:
+        return np.zeros(len(self._rows), dtype=np.bool_)
+
+    def _leader(self) -> int:
+        return -1
+
+    def _links(self, who: NDArray[np.int64]) -> Array:
+        """Hearer, sender (as rows of the flying ones), relative weight, freshness, (l, 4)."""
+        return np.zeros((0, 4))
+
+
+class TrackingPictures(Pictures):
+    """Of flight i of a tracking batch."""
+
+    def __init__(self, batch: TrackingBatch, i: int, size: tuple[int, int]) -> None:
+        super().__init__(batch.task, batch.rows[i : i + 1], size)
+        self._batch, self._i = batch, i
+
+    def _wishes(self) -> tuple[Array, Array]:
+        rows = self._batch.reference(self._i)[: self._task.episode_steps + 1]
+        return np.asarray(rows[None, :, POSITION]), np.zeros((0, 3))
+
+    def _lines(self, k: int) -> tuple[str, ...]:
+        p = self._rows[0, PLANT][POSITION]
+        off = float(np.linalg.norm(p - self._wanted[0, min(k, self._wanted.shape[1] - 1)]))
+        return (*super()._lines(k), f"position error {off:.2f} m", f"height {0.0 - p[2]:.2f} m")
+
+
+class TeamPictures(Pictures):
+    """Of the first team of a batch; with the mode "human" each moment is shown in a window."""
+
+    def __init__(self, batch: TeamBatch, size: tuple[int, int], mode: str) -> None:
+        super().__init__(batch.task, batch.rows[: batch.n], size)
+        self._mode = mode
+        self._window: Window | None = None
+        self._batch = batch
+        self._on_rails = isinstance(batch.options, EstimationOptions)
+        self._heaviest = float((batch.graphs.graphs * (1.0 - np.eye(batch.n))).max(initial=1e-9))
+
+    def record(self, actions: NDArray[np.float32] | None = None) -> None:
+        """Take the present moment down; on rails the actions are estimates, carried on to the present."""
+        super().record(actions)
+        if self._on_rails and actions is not None:
+            told = np.clip(actions.reshape(len(self._rows), -1), -1.0, 1.0)
+            drift = ESTIMATE_SPEED * told[:, 3:] - self._rows[:, PLANT][:, VELOCITY]
+            self._estimates = (
+                self._rows[:, PLANT][:, POSITION] + ESTIMATE_REACH * told[:, :3] + self._task.dt * drift
+            )
+        if self._mode == "human":
+            self._show_in_window()
+
+    def show(self) -> NDArray[np.uint8] | None:
+        """The picture, or with "human" nothing: it has been in the window since it was recorded."""
+        if self._mode != "human":
+            return self.frame()
+        if self._framing is None:
+            raise gymnasium.error.ResetNeeded("call reset() before render()")
+        return None
+
+    def _show_in_window(self) -> None:
+        if self._window is None:
+            self._window = Window(self.size, self._task.env_id)
+        self._window.show(self.frame(), round(1.0 / self._task.dt))
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    def _wishes(self) -> tuple[Array, Array]:
+        batch = self._batch
+        target = batch.target(0)[:, POSITION] if self._has_target else np.zeros((0, 3))
+        if not self._on_rails:
+            return batch.wanted(0)[..., POSITION], target
+        times = self._task.dt * np.arange(self._task.episode_steps + 1)[:, None]
+        plants = self._rows[:, PLANT]
+        return plants[:, None, POSITION] + plants[:, None, VELOCITY] * times, target
+
+    @property
+    def _has_target(self) -> bool:
+        return not self._batch.options.has_leader
+
+    def _path(self) -> Array:
+        return self._wanted[0, :0] if self._has_target else self._wanted[0]
+
+    def _lines(self, k: int) -> tuple[str, ...]:
+        flies = self._alive()
+        error, near = self._rows[flies, SLOT_ERROR], self._rows[flies, NEAREST]
+        if not error.size:
+            return super()._lines(k)
+        what = "estimates off by" if self._on_rails else "slot error"
+        lines = (*super()._lines(k), f"{what} {error.mean():.2f} m")
+        return lines if self._on_rails else (*lines, f"nearest pair {near.min():.2f} m")
+
+    def _alive(self) -> NDArray[np.bool_]:
+        return np.asarray(self._rows[:, ALIVE] > 0.0)
+
+    def _sights(self) -> NDArray[np.bool_]:
+        return np.asarray(self._rows[:, MEASURES] > 0.0) & self._has_target
+
+    def _leader(self) -> int:
+        return 0 if self._batch.options.has_leader else -1
+
+    def _links(self, who: NDArray[np.int64]) -> Array:
+        batch, k = self._batch, self._rows[0, STEP]
+        heard, lifetime = batch.heard(0)[who], batch.options.message_lifetime
+        age = (k - heard[..., SENT]) * self._task.dt
+        i, s = np.nonzero((heard[..., WEIGHT] > 0.0) & (age <= lifetime + 1e-9))
+        row = np.full(batch.n + 1, -1)
+        row[who] = np.arange(who.size)
+        weight, fresh = heard[i, s, WEIGHT] / self._heaviest, 1.0 - age[i, s] / lifetime
+        links = np.column_stack([i, row[batch.neighbours[who[i], s]], weight, fresh])
+        return np.asarray(links[links[:, 1] >= 0.0])
+
+
+def _too_near(names: tuple[str, ...], values: Array) -> NDArray[np.bool_]:
+    """Who violates the separation, of the limits' values (n, number of limits), (n,)."""
+    if "separation" not in names:
+        return np.zeros(len(values), dtype=np.bool_)
+    return np.asarray(values[:, names.index("separation")] > TOLERANCE)
+
+
+def _limit_texts(names: tuple[str, ...], values: Array) -> tuple[tuple[str, bool], ...]:
+    """Each limit, and by how much and by how many it is violated, of values (n, number of limits)."""
+    texts = []
+    for name, column in zip(names, values.T, strict=True):
+        over = column[column > TOLERANCE]
+        many = f" ({over.size})" if len(values) > 1 else ""
+        texts.append((f"{name} +{over.max():.2f} {_UNITS[name]}{many}" if over.size else name, over.size > 0))
+    return tuple(texts)
