@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from .comparison import Results
     from .conformance import check_policy
     from .errors import PolicyCheckError, ResultsError
+    from .estimate_wrapper import EstimateWrapper
     from .evaluation import Evaluation, evaluate
     from .metrics import Estimate, Record, estimate, measure, paired_difference
     from .policy import Policy, PolicyState, make_policy, policy_options
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 _PUBLIC = {
     "Episode": "rollout",
     "Estimate": "metrics",
+    "EstimateWrapper": "estimate_wrapper",
     "Evaluation": "evaluation",
     "Policy": "policy",
     "PolicyCheckError": "errors",
@@ -43,6 +45,7 @@ _PUBLIC = {
 __all__ = [
     "Episode",
     "Estimate",
+    "EstimateWrapper",
     "Evaluation",
     "Policy",
     "PolicyCheckError",

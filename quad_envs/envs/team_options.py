@@ -183,9 +183,10 @@ class TeamOptions(VehicleOptions):
         """Whether news from an informed vehicle can reach everybody, in the union of all graphs."""
         n = self.vehicles
         union = np.eye(n + 1)
-        union[1:, 1:] = graphs.graphs.max(axis=0)
+        if self.drop_out < 1.0:
+            union[1:, 1:] = graphs.graphs.max(axis=0)
         union[[1 + i for i in self.informed()], 0] = 1.0
-        return has_spanning_tree(union) and self.drop_out < 1.0
+        return has_spanning_tree(union)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
