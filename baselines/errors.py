@@ -13,3 +13,7 @@ class ResultsError(ValueError):
 
 class CheckpointError(ValueError):
     """A checkpoint cannot be read or written; the message says why and what to do."""
+
+
+class TrainingError(RuntimeError):
+    """Training cannot go on; the message says at which update and why."""

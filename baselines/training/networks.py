@@ -66,7 +66,7 @@ class Features:
         missing = [name for name in self.names if name not in known]
         if missing:
             raise ValueError(
-                f"the network sees {missing[0]} (and {len(missing) - 1} more), which observations of this task "
+                f"the network sees {missing[0]} (and {len(missing) - 1} more), which observations here "
                 "lack: evaluate it in a task with the layout it was trained on (preview, limits, slots)"
             )
         return np.array([known[name] for name in self.names], dtype=np.int64)
@@ -92,15 +92,19 @@ def entry_names(layout: TrackingLayout | AgentLayout) -> list[str]:
     ]
 
 
+def preview_stages(preview: int) -> tuple[int, ...]:
+    """Stages of a preview that networks see."""
+    return tuple(stage for stage in TRACKING_STAGES if stage <= preview)
+
+
 def default_features(layout: TrackingLayout | AgentLayout, stages: tuple[int, ...] | None = None) -> Features:
     """Everything but some preview stages, scaled to order one.
 
     Args:
         layout: Of the task.
-        stages: Preview stages to keep; None for `TRACKING_STAGES` as far as they go.
+        stages: Preview stages to keep; None for `preview_stages`.
     """
-    if stages is None:
-        stages = TRACKING_STAGES
+    stages = preview_stages(layout.preview) if stages is None else stages
     names, scale = [], []
     for name, shape in part_shapes(layout).items():
         row = _ROW_SCALES.get(name, (_SCALES.get(name, 1.0),))

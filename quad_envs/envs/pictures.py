@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..constraints import TOLERANCE
 from ..parameters import POSITION, VELOCITY, Array
 from ..scenes import Framing, Scene
-from ..tasks import BaseTask
+from ..tasks import Task, TeamTask
 from ..window import Window
 from .batch import TrackingBatch
 from .exchange import ALIVE, MEASURES, NEAREST, SENT, SLOT_ERROR, WEIGHT
@@ -58,14 +58,15 @@ class Pictures:
     """Records one flight and shows it.
 
     Args:
-        task: The task.
-        rows: Rows of its vehicles in the batch, a view, (n, row size).
+        batch: What flies.
+        vehicles: Rows of the flight's vehicles in the batch.
         size: Width and height of the pictures, pixels.
     """
 
-    def __init__(self, task: BaseTask, rows: Array, size: tuple[int, int]) -> None:
+    def __init__(self, batch: TrackingBatch | TeamBatch, vehicles: slice, size: tuple[int, int]) -> None:
         self.size = size
-        self._task, self._rows = task, rows
+        self._flying, self._vehicles = batch, vehicles
+        task = self._task
         self._trail: deque[Array] = deque(maxlen=max(2, round(_TRAIL / task.dt) + 1))
         self._rewards = 0.0
         self._wanted = np.zeros((0, 0, 3))
@@ -76,6 +77,15 @@ class Pictures:
         self._box = np.array([limits.position_lower, limits.position_upper])
         if not limits.has_position:
             self._box = self._box[:0]
+
+    @property
+    def _task(self) -> Task | TeamTask:
+        return self._flying.task
+
+    @property
+    def _rows(self) -> Array:
+        """Of the vehicles; a view that is taken anew each time, so that an environment can be copied."""
+        return self._flying.rows[self._vehicles]
 
     def record(self, actions: NDArray[np.float32] | None = None) -> None:
         """Take the present moment down, and the actions that led there; a reset begins anew."""
@@ -185,7 +195,7 @@ class TrackingPictures(Pictures):
     """Of flight i of a tracking batch."""
 
     def __init__(self, batch: TrackingBatch, i: int, size: tuple[int, int]) -> None:
-        super().__init__(batch.task, batch.rows[i : i + 1], size)
+        super().__init__(batch, slice(i, i + 1), size)
         self._batch, self._i = batch, i
 
     def _wishes(self) -> tuple[Array, Array]:
@@ -202,7 +212,7 @@ class TeamPictures(Pictures):
     """Of the first team of a batch; with the mode "human" each moment is shown in a window."""
 
     def __init__(self, batch: TeamBatch, size: tuple[int, int], mode: str) -> None:
-        super().__init__(batch.task, batch.rows[: batch.n], size)
+        super().__init__(batch, slice(batch.n), size)
         self._mode = mode
         self._window: Window | None = None
         self._batch = batch

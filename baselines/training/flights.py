@@ -1,0 +1,158 @@
+"""Tracking flights as a differentiable function of the actions.
+
+The forward pass is the environments' compiled step, resets included; the backward pass is its adjoint. A
+flight that ends begins anew in the same step, and no gradient passes through that.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_envs.adjoint import SCRATCH_ROWS
+from quad_envs.envs.adjoint import action_slopes, tracking_vjp_rows
+from quad_envs.envs.batch import TrackingBatch
+from quad_envs.envs.kernel import (
+    COEFFICIENTS,
+    COMMAND,
+    CRASHED,
+    FORCE_MAX,
+    PLANT,
+    REWARD,
+    STEP,
+    TRUNCATED,
+    task_vector,
+)
+from quad_envs.envs.options import TrackingOptions
+from quad_envs.parameters import Array
+
+from .networks import Features, default_features, preview_stages
+
+Bools = NDArray[np.bool_]
+Floats = NDArray[np.float32]
+_OWN = 18
+
+
+class Record(NamedTuple):
+    """One step of all flights, as far as its adjoint needs it."""
+
+    plants: Array  # (n, 16), before
+    commands: Array  # (n, 4), N
+    previous: Array  # (n, 4), N, commands of the step before
+    after: Array  # (n, 16), afterwards, before any reset
+    references: Array  # (n, 8), of the time afterwards
+    crashed: Bools  # (n,)
+    force_max: Array  # (n,), N
+    coefficients: Array  # (n, N_COEFFICIENTS)
+    slopes: Array  # (n, 4), of the commands by the actions
+    rewards: Array  # (n,)
+    done: Bools  # (n,), flights that began anew
+
+
+class DifferentiableFlights:
+    """n flights of a tracking task, from starts of the environment, at all times of the episode.
+
+    Args:
+        options: Of the task; its reward must be the bounded one, and it must not have disturbances.
+        n: Number of flights.
+        seed: Of the starts.
+
+    Raises:
+        ValueError: If the task cannot be differentiated.
+    """
+
+    def __init__(self, options: TrackingOptions, n: int, seed: int) -> None:
+        if options.reward != "bounded" or options.disturbance is not None or max(options.noise_deviations()):
+            raise ValueError(
+                "the analytic policy gradient needs reward='bounded' and neither disturbance nor sensor_noise"
+            )
+        self.batch, self.n, self.rng = TrackingBatch(options, n), n, np.random.default_rng(seed)
+        self.task = self.batch.task
+        self.features: Features = default_features(self.task.layout)
+        self._stages = np.array(preview_stages(self.task.layout.preview), dtype=np.int64)
+        self._mean, self._scale = np.asarray(self.features.mean), np.asarray(self.features.scale)
+        self._vector = task_vector(self.task, options.substeps, options.lost_distance)
+        self._scratch = np.zeros((SCRATCH_ROWS + 4, 16))
+        self._out = np.empty((n, self.task.layout.size), dtype=np.float32)
+        # The first episodes are cut at random, so that the flights are at all times of the episode.
+        self._cut = self.rng.integers(1, self.task.episode_steps + 1, n)
+        for i in range(n):
+            self.batch.reset_row(i, self.rng, self._out[i])
+
+    def observe(self) -> Floats:
+        """Scaled features of all flights as they are, (n, features)."""
+        rows, references = self.batch.rows, self.batch.references
+        p, psi = rows[:, None, :3], rows[:, 8:9]
+        steps = rows[:, STEP].astype(np.int64)[:, None] + self._stages
+        preview = references[self.batch.which[0][:, None], np.minimum(steps, references.shape[1] - 1)]
+        preview[:, :, :3] -= p
+        parts = [rows[:, 3:8], np.sin(psi), np.cos(psi), rows[:, 9:20]]
+        if self.task.layout.position:
+            parts.append(rows[:, :3])
+        parts.append(preview.reshape(self.n, -1))
+        return ((np.concatenate(parts, axis=1) - self._mean) / self._scale).astype(np.float32)
+
+    def observe_vjp(self, plants: Array, bar: Floats) -> tuple[Array, Array]:
+        """Sensitivities to the plants (n, 16) and the last commands (n, 4) from those to `observe`."""
+        full = bar / self._scale
+        out, at = np.zeros((self.n, 16)), _OWN
+        out[:, 3:8] = full[:, :5]
+        out[:, 8] = full[:, 5] * np.cos(plants[:, 8]) - full[:, 6] * np.sin(plants[:, 8])
+        out[:, 9:16] = full[:, 7:14]
+        if self.task.layout.position:
+            out[:, :3] += full[:, at : at + 3]
+            at += 3
+        out[:, :3] -= full[:, at:].reshape(self.n, -1, 8)[:, :, :3].sum(axis=1)
+        return out, full[:, 14:18]
+
+    def advance(self, actions: Floats) -> Record:
+        """One step of all flights; those that end begin anew."""
+        rows, references = self.batch.rows, self.batch.references
+        plants, previous = rows[:, PLANT].copy(), rows[:, COMMAND].copy()
+        self.batch.step(actions, self._out)
+        slopes = np.empty((self.n, 4))
+        action_slopes(actions, self._vector, slopes)
+        steps = np.minimum(rows[:, STEP].astype(np.int64), references.shape[1] - 1)
+        crashed = rows[:, CRASHED] > 0.0
+        self._cut -= 1
+        done = crashed | (rows[:, TRUNCATED] > 0.0) | (self._cut == 0)
+        record = Record(
+            plants=plants,
+            commands=rows[:, COMMAND].copy(),
+            previous=previous,
+            after=rows[:, PLANT].copy(),
+            references=references[self.batch.which[0], steps],
+            crashed=crashed,
+            force_max=rows[:, FORCE_MAX].copy(),
+            coefficients=rows[:, COEFFICIENTS].copy(),
+            slopes=slopes,
+            rewards=rows[:, REWARD].copy(),
+            done=done,
+        )
+        for i in np.flatnonzero(done).tolist():
+            self.batch.reset_row(i, self.rng, self._out[i])
+        return record
+
+    def advance_vjp(
+        self, record: Record, bar_after: Array, bar_commands: Array, bar_rewards: Array
+    ) -> tuple[Array, Array, Array]:
+        """Adjoint of `advance`.
+
+        Args:
+            record: Of the step.
+            bar_after: Sensitivity to the plants afterwards, (n, 16).
+            bar_commands: To the commands, as the next observation shows them, (n, 4).
+            bar_rewards: To the rewards, (n,).
+
+        Returns:
+            Sensitivities to the actions (n, 4), the plants (n, 16) and the commands before (n, 4).
+        """
+        flew_on = ~record.done[:, None]
+        plants, commands, previous = np.empty((self.n, 16)), np.empty((self.n, 4)), np.empty((self.n, 4))
+        tracking_vjp_rows(
+            *record[:8], self._vector, bar_after * flew_on, bar_rewards, plants, commands, previous,
+            self._scratch,
+        )  # fmt: skip
+        return (commands + bar_commands * flew_on) * record.slopes, plants, previous

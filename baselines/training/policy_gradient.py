@@ -1,0 +1,131 @@
+"""Analytic policy gradient: the reward's gradient by backpropagation through the compiled dynamics.
+
+Model-based: it knows the equations of motion and the reward. Windows of `horizon` steps of many flights are
+rolled out and taken back; flights go on from window to window. The objective is sum_t gamma^t log(r_t + eps),
+because the gradient of the bounded reward itself vanishes where a flight is far off; evaluation is always on
+the reward.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from quad_envs.envs.options import TrackingOptions
+
+from ..errors import TrainingError
+from .flights import DifferentiableFlights
+from .networks import Floats, Network, hover_actions
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyGradientOptions:
+    """Hyperparameters of the analytic policy gradient."""
+
+    flights: int = 64
+    horizon: int = 25  # steps of a window
+    substeps: int = 2  # of the integrator while training; 5 in evaluation
+    learning_rate: float = 1e-2
+    final_rate: float = 0.03  # share of the learning rate at the end of the budget
+    discount: float = 0.99
+    epsilon: float = 1e-3  # of log(r + epsilon)
+    hidden: tuple[int, ...] = (64, 64)
+    gradient_norm: float = 1.0  # to which gradients are clipped
+
+
+class Progress(NamedTuple):
+    """After an update."""
+
+    update: int
+    steps: int  # environment steps so far
+    reward: float  # mean of the window
+
+
+class Actor:
+    """A tanh network in torch, with outputs in [-1, 1]."""
+
+    def __init__(self, inputs: int, hidden: tuple[int, ...], outputs: int) -> None:
+        sizes = (inputs, *hidden, outputs)
+        self.layers = [torch.nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False)]
+        with torch.no_grad():  # begins near hover
+            self.layers[-1].weight.mul_(0.1)
+            self.layers[-1].bias.zero_()
+        self.parameters = [parameter for layer in self.layers for parameter in layer.parameters()]
+
+    def __call__(self, x: Any) -> Any:
+        for layer in self.layers:
+            x = torch.tanh(layer(x))
+        return x
+
+    def arrays(self) -> tuple[tuple[Floats, ...], tuple[Floats, ...]]:
+        """Weights (inputs, outputs) and biases as numpy arrays."""
+        return (
+            tuple(np.ascontiguousarray(layer.weight.detach().numpy().T) for layer in self.layers),
+            tuple(layer.bias.detach().numpy().copy() for layer in self.layers),
+        )
+
+
+def _window_gradient(actor: Actor, flights: DifferentiableFlights, options: PolicyGradientOptions) -> float:
+    """Roll a window out, take it back, leave the gradient in the actor's parameters; the mean reward."""
+    task, gain = flights.task, flights.task.hover_force / (flights.task.force_max - flights.task.hover_force)
+    seen, outputs, records = [], [], []
+    for _ in range(options.horizon):
+        x = torch.from_numpy(flights.observe()).requires_grad_()
+        out = actor(x)
+        seen.append(x)
+        outputs.append(out)
+        records.append(flights.advance(hover_actions(out.detach().numpy(), task)))
+    n = flights.n
+    plants, commands = np.zeros((n, 16)), np.zeros((n, 4))
+    for t in range(options.horizon - 1, -1, -1):
+        record, x, out = records[t], seen[t], outputs[t]
+        weight = -(options.discount**t) / (n * options.horizon)
+        rewards = np.where(record.crashed, 0.0, weight / (record.rewards + options.epsilon))
+        actions, plants, commands = flights.advance_vjp(record, plants, commands, rewards)
+        value = out.detach().numpy()
+        slope = np.where(value < 0.0, 1.0, np.where(gain * value < 1.0, gain, 0.0))
+        out.backward(torch.from_numpy((actions * slope).astype(np.float32)))
+        own, last = flights.observe_vjp(record.plants, x.grad.numpy())
+        plants, commands = plants + own, commands + last
+    return float(np.mean([record.rewards for record in records]))
+
+
+def train(
+    task_options: TrackingOptions,
+    options: PolicyGradientOptions,
+    seed: int,
+    spent: Callable[[], float],
+) -> Iterator[tuple[Progress, Network]]:
+    """Train, and yield after each update.
+
+    Args:
+        task_options: Of the tracking environment.
+        options: Hyperparameters.
+        seed: Of everything random.
+        spent: Share of the budget that is used up, 0 to 1; training ends at 1.
+
+    Raises:
+        ValueError: If the task cannot be differentiated.
+        TrainingError: If the gradient is not finite.
+    """
+    torch.manual_seed(seed)
+    flights = DifferentiableFlights(task_options, options.flights, seed)
+    actor = Actor(len(flights.features.names), options.hidden, 4)
+    optimizer = torch.optim.Adam(actor.parameters, lr=options.learning_rate)
+    update = 0
+    while (share := spent()) < 1.0:
+        for group in optimizer.param_groups:
+            group["lr"] = options.learning_rate * (1.0 - (1.0 - options.final_rate) * share)
+        optimizer.zero_grad()
+        reward = _window_gradient(actor, flights, options)
+        norm = float(torch.nn.utils.clip_grad_norm_(actor.parameters, options.gradient_norm))
+        if not np.isfinite(norm):
+            raise TrainingError(f"the gradient is {norm} at update {update}: the last good policy is kept")
+        optimizer.step()
+        update += 1
+        steps = update * options.flights * options.horizon
+        yield Progress(update, steps, reward), Network(flights.features, *actor.arrays())
