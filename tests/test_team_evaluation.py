@@ -15,6 +15,7 @@ from baselines.benchmark import flight_arrays
 from baselines.comparison import Results
 from baselines.environments import make_env, task_of
 from baselines.episode import Episode
+from baselines.estimate_wrapper import EstimateWrapper
 from baselines.evaluation import Evaluation
 from baselines.metrics import Record, estimate, paired_difference, summarize, totals
 from baselines.policy import Estimates, PolicyState
@@ -446,3 +447,10 @@ def test_list_shows_the_ids_of_teams_and_their_options(capsys, env_id):
     assert main(["list", env_id, "--json"]) == 0
     options = json.loads(capsys.readouterr().out)
     assert options["graph"] and ("sensor" in options) == (env_id != FORMATION) and "env_id" not in options
+
+
+def test_the_task_of_the_estimate_wrapper_is_its_own_and_its_filter_is_measured():
+    env = EstimateWrapper(make_env(TARGET, **SHORT))
+    assert task_of(env).layout.estimate and not task_of(env.unwrapped).layout.estimate
+    record = evaluate(make_policy("hover", env), env, 1).records[0]
+    assert 0.0 < record.estimate_rmse < 1.0 and record.anees > 0.0 and record.nis_ratio > 0.0
