@@ -92,7 +92,8 @@ class DifferentiableFlights:
         if self.task.layout.position:
             parts.append(rows[:, :3])
         parts.append(preview.reshape(self.n, -1))
-        return ((np.concatenate(parts, axis=1) - self._mean) / self._scale).astype(np.float32)
+        scaled = (np.concatenate(parts, axis=1) - self._mean) / self._scale
+        return np.asarray(scaled, dtype=np.float32)
 
     def observe_vjp(self, plants: Array, bar: Floats) -> tuple[Array, Array]:
         """Sensitivities to the plants (n, 16) and the last commands (n, 4) from those to `observe`."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,13 +51,14 @@ class Actor:
 
     def __init__(self, inputs: int, hidden: tuple[int, ...], outputs: int) -> None:
         sizes = (inputs, *hidden, outputs)
-        self.layers = [torch.nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False)]
+        self.layers = [torch.nn.Linear(a, b) for a, b in pairwise(sizes)]
         with torch.no_grad():  # begins near hover
             self.layers[-1].weight.mul_(0.1)
             self.layers[-1].bias.zero_()
         self.parameters = [parameter for layer in self.layers for parameter in layer.parameters()]
 
     def __call__(self, x: Any) -> Any:
+        """Outputs for scaled features (n, inputs), (n, outputs)."""
         for layer in self.layers:
             x = torch.tanh(layer(x))
         return x
@@ -89,6 +91,7 @@ def _window_gradient(actor: Actor, flights: DifferentiableFlights, options: Poli
         value = out.detach().numpy()
         slope = np.where(value < 0.0, 1.0, np.where(gain * value < 1.0, gain, 0.0))
         out.backward(torch.from_numpy((actions * slope).astype(np.float32)))
+        assert x.grad is not None
         own, last = flights.observe_vjp(record.plants, x.grad.numpy())
         plants, commands = plants + own, commands + last
     return float(np.mean([record.rewards for record in records]))
