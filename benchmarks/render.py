@@ -68,10 +68,8 @@ def main() -> None:
         json.dump({"machine": machine(), "rates": found, "ratios": ratios}, sys.stdout, indent=2)
         print()
         return
-    rows = [
-        [name, f"{rate:,.0f}", f"{_GOALS[name]:,.0f}" if name in _GOALS else ""]
-        for name, rate in found.items()
-    ]
+    goals = {name: f"{goal:g}" for name, goal in _GOALS.items()}
+    rows = [[name, f"{rate:,.0f}", goals.get(name, "")] for name, rate in found.items()]
     print(machine(), end="\n\n")
     print(format_table(["", "measured", "goal"], rows), end="\n\n")
     for name, ratio in ratios.items():

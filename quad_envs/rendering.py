@@ -58,7 +58,7 @@ def render(scene: Scene, width: int, height: int) -> Frame:
     letter = max(10, round(min(height / 34.0, width / 45.0)))  # size of the text, pixels
     glyph = 0.6 * SPAN * height
     canvas = Canvas(
-        width, height, scene.view, np.array([glyph, 2.0 * letter + glyph, glyph, 2.0 * letter + glyph])
+        width, height, scene.view, np.array([glyph, 2.0 * letter + glyph, glyph, 3.0 * letter + glyph])
     )
     magnified = magnification(scene, canvas)
     _draw_ground(scene, canvas)
@@ -151,14 +151,11 @@ def _draw_overview(scene: Scene, canvas: Canvas) -> None:
 
 
 def _write(scene: Scene, canvas: Canvas, letter: int, magnified: float) -> None:
-    """Title, time and score on the left, limits on the right, axes and scale below."""
+    """Title, time and score above, left, limits on the right; axes and scale below."""
     margin, step = 0.7 * letter, 1.35 * letter
     canvas.text(margin, margin, scene.title, round(1.15 * letter), INK)
-    for row, line in enumerate(scene.lines):
-        canvas.text(margin, margin + 1.5 * letter + row * step, line, letter, INK)
-    if scene.ended:
-        y = margin + 1.5 * letter + len(scene.lines) * step
-        canvas.text(margin, y, scene.ended, letter, RED)
+    canvas.text(margin, margin + 1.5 * letter, "    ".join(scene.lines), letter, INK)
+    canvas.text(margin, margin + 1.5 * letter + step, scene.ended, letter, RED)
     for row, (what, violated) in enumerate(scene.limits):
         y = margin + row * step
         canvas.text(canvas.width - margin, y, what, letter, RED if violated else FAINT, "ra")

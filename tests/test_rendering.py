@@ -16,6 +16,7 @@ from pettingzoo.utils import parallel_to_aec
 
 from quad_envs import cooperative_estimation_v0, formation_v0, target_tracking_v0
 from quad_envs.canvas import PURPLE, RED, halve
+from quad_envs.envs.tracking_vector import TrackingVectorEnv
 from quad_envs.registration import TRACKING
 from quad_envs.scenes import CAMERA, Framing, depth, project
 
@@ -98,10 +99,7 @@ def test_a_picture_is_the_same_when_it_is_asked_for_twice():
 
 
 def test_rendering_does_not_change_the_flight():
-    plain, shown = (
-        gym.make("quad/RandomTracking-v0"),
-        gym.make("quad/RandomTracking-v0", render_mode="rgb_array"),
-    )
+    plain, shown = (gym.make("quad/RandomTracking-v0", render_mode=mode) for mode in (None, "rgb_array"))
     assert np.array_equal(plain.reset(seed=1)[0], shown.reset(seed=1)[0])
     for _ in range(10):
         a, b = plain.step(HOVER), shown.step(HOVER)
@@ -260,10 +258,9 @@ def test_halving_is_the_rounded_mean_of_four_pixels():
 
 
 def test_a_vector_of_flights_gives_one_picture_each_as_single_flights_do():
-    env = gym.make_vec("quad/LemniscateTracking-v0", num_envs=2, render_mode="rgb_array", time_limit=0.2)
-    singles = [
-        gym.make("quad/LemniscateTracking-v0", render_mode="rgb_array", time_limit=0.2) for _ in range(2)
-    ]
+    kwargs = {"render_mode": "rgb_array", "time_limit": 0.2}
+    env = gym.make_vec("quad/LemniscateTracking-v0", num_envs=2, **kwargs)
+    singles = [gym.make("quad/LemniscateTracking-v0", **kwargs) for _ in range(2)]
     env.reset(seed=5)
     for i, single in enumerate(singles):
         single.reset(seed=5 + i)
@@ -279,8 +276,7 @@ def test_a_vector_of_flights_gives_one_picture_each_as_single_flights_do():
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_trails_of_a_vector_begin_anew_with_the_episode(mode):
-    kwargs = {"vector_kwargs": {"autoreset_mode": mode}, "render_mode": "rgb_array", "time_limit": 0.2}
-    env = gym.make_vec("quad/HelixTracking-v0", num_envs=1, **kwargs).unwrapped
+    env = TrackingVectorEnv(1, autoreset_mode=mode, render_mode="rgb_array", time_limit=0.2)
     env.reset(seed=0)
     for _ in range(7):
         env.step(np.zeros((1, 4), dtype=np.float32))

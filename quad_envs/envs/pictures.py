@@ -123,7 +123,7 @@ class Pictures:
         who, plants = np.flatnonzero(flies), rows[flies, PLANT]
         values = rows[flies, VALUES : VALUES + len(task.constraint_names)]
         names = task.constraint_names
-        aim = self._target[max(0, k + 2 - len(self._trail)) : k + 1]
+        aim = self._target[max(0, k + 1 - len(self._trail)) : k + 1]
         path, links = self._path(), self._links(who)
         leader = np.flatnonzero(who == self._leader())
         return Scene(
