@@ -44,7 +44,7 @@ def check_policy(policy: Policy, env: Any, seed: int = 0) -> None:
         space = env.action_space(env.possible_agents[0])
         if getattr(policy, "privileged", False):
             n = len(env.possible_agents)
-            space = Box(*(np.broadcast_to(bound, (n, *space.shape)) for bound in (space.low, space.high)))
+            space = Box(np.tile(space.low, (n, 1)), np.tile(space.high, (n, 1)))
             flights = _collect_states(policy, env, space, seed)
         else:
             flights = _collect_agents(policy, env, space, seed)

@@ -237,39 +237,15 @@ def make_cooperative_mpc(
 ) -> TeamPolicy:
     """The policy of chapter 7. Where vehicles run on rails, its answer is its estimate.
 
-    Args:
-        task: With a target.
-        horizon: See `controllers.cooperative_mpc.CooperativeMpc`, as all others but the next two.
-        alpha: See there.
-        terminal_weight: See there.
-        q: Density of the target's acceleration in the filter, m^2/s^3; None: 0.02 for estimation, 0.05 for
-            tracking.
-        estimates: "own": a filter per agent in `state`; "shared": the estimates that `EstimateWrapper` put
-            into the observation; None: shared where they are there.
-        neighbour: See there.
-        feed_forward: See there.
-        attitude: See there.
-        reach: See there; 2 m, since the target is far at the start.
-        speed: See there.
-        formation_weight: P_f of (7.2), m^2.
-        target: See there.
-        avoidance: See there.
-        avoidance_set: See there.
-        moving_centre: See there.
-        braking_time: See there.
-        swirl: See there.
-        separation_weight: See there.
-        soft_weight: See there.
-        margin: See there.
-        reject_disturbance: See there.
-        estimator_gain: See there.
-        iteration_limit: See there.
+    Options are those of `controllers.cooperative_mpc.CooperativeMpc` (reach is 2 m: the target is far at the
+    start), and two more. `q` is the density of the target's acceleration in the filter, m^2/s^3; None: 0.02
+    for estimation, 0.05 for tracking. `estimates` is "own", a filter per agent in `state`, or "shared", what
+    `EstimateWrapper` put into the observation; None: shared where it is there.
 
     Raises:
         ValueError: If the task has no target, or an option is not allowed.
     """
-    shared = _shares_estimates(task, estimates)
-    estimator = None if shared else TargetEstimator(task, q)
+    name, shared = "cooperative-mpc", _shares_estimates(task, estimates, q)
     controller = CooperativeMpc(
         task, horizon, alpha, terminal_weight, neighbour=neighbour, feed_forward=feed_forward,
         attitude=attitude, reach=reach, speed=speed, formation_weight=formation_weight, target=target,
@@ -279,25 +255,26 @@ def make_cooperative_mpc(
         estimator_gain=estimator_gain, iteration_limit=iteration_limit,
     )  # fmt: skip
     if task.mission != "estimation":
-        return TargetMpc(controller, estimator)
-    if shared:
-        return SharedEstimatePolicy(task, "cooperative-mpc")
-    return EstimatorPolicy(task, "cooperative-mpc", q, trilaterate=False)
+        return TargetMpc(controller, None if shared else TargetEstimator(task, q))
+    return SharedEstimatePolicy(task, name) if shared else EstimatorPolicy(task, name, q, trilaterate=False)
 
 
-def _shares_estimates(task: TeamTask, estimates: Any) -> bool:
+def _shares_estimates(task: TeamTask, estimates: Any, q: float | None) -> bool:
     """Whether the estimates come from the observation.
 
     Raises:
-        ValueError: If there is no such source, or the observation has no estimates.
+        ValueError: If there is no such source, the observation has no estimates, or q would have no effect.
     """
-    if estimates is None:
-        return task.layout.estimate
-    if estimates not in get_args(EstimateSource):
+    if estimates is not None and estimates not in get_args(EstimateSource):
         raise ValueError(unknown_name("value of estimates", estimates, get_args(EstimateSource)))
-    if estimates == "shared" and not task.layout.estimate:
+    shared = task.layout.estimate if estimates is None else estimates == "shared"
+    if shared and not task.layout.estimate:
         raise ValueError(
             f"estimates='shared' needs estimates in the observation of {task.env_id!r}: put an "
             "EstimateWrapper around the environment, or take estimates='own'"
         )
-    return bool(estimates == "shared")
+    if shared and q is not None:
+        raise ValueError(
+            f"q = {q!r} belongs to a filter of one's own: give it to the EstimateWrapper instead"
+        )
+    return bool(shared)

@@ -270,32 +270,8 @@ def decode_and_filter(
 ) -> int:
     """Split observations, and move the filters of all agents on by one step.
 
-    Args:
-        obs: (n, layout.size) float32.
-        starts: Of the parts, see `part_starts`.
-        start: (n,) bool, rows that begin an episode.
-        memory: (n, a + FILTER_SIZE).
-        plants: Output, as the next ones, see `decode_rows`.
-        last_commands: Output.
-        leaders: Output.
-        previews: Output.
-        comms: Output.
-        sensed: Output.
-        disturbances: Output.
-        measured: Output.
-        slots: Output.
-        estimates: Output.
-        first: Output, the first part of the memory, (n, a).
-        filters: Output, the filters' part, (n, FILTER_SIZE).
-        reports: Output, (n, N_REPORT).
-        velocity: See `filter_row`, as the rest.
-        sigma: See there.
-        rows: See there.
-        coefficients: See there.
-        limits: See there.
-        data: See there.
-        valid: Overwritten.
-        scratch: Overwritten.
+    `obs`, `starts` and the parts from `plants` to `estimates` are those of `decode_rows`, what follows
+    `reports` is that of `filter_row`; a memory (n, a + FILTER_SIZE) is split into first (n, a) and filters.
 
     Returns:
         Flat index of the first entry that is not finite, or -1.

@@ -64,8 +64,8 @@ def chapter_7_env(graph, target, measuring, shared=False, **options):
     return EstimateWrapper(env) if shared else env
 
 
-def chapter_7_flight(graph, target, measuring, shared=False, env_options=None, **options):
-    env = chapter_7_env(graph, target, measuring, shared, **(env_options or {}))
+def chapter_7_flight(graph, motion, measuring, shared=False, env_options=None, **options):
+    env = chapter_7_env(graph, motion, measuring, shared, **(env_options or {}))
     return fly(make_policy("cooperative-mpc", env, **options), env)
 
 

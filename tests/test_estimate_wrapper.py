@@ -193,6 +193,7 @@ def test_a_wrapped_environment_pickles_in_the_middle_of_an_episode():
         (lambda: EstimateWrapper(object()), "needs a ParallelEnv of this suite"),
         (lambda: wrapped("majority"), "unknown fusion 'majority'"),
         (lambda: wrapped(q=-1.0), "q must be finite and >= 0"),
+        (lambda: make_policy("cooperative-mpc", wrapped(), q=0.1), "give it to the EstimateWrapper"),
     ],
 )
 def test_what_is_not_allowed_is_refused(make, message):
