@@ -10,9 +10,14 @@ from pathlib import Path
 from quad_envs.names import unknown_name
 
 from ..results import write_atomic
+from .estimation_claims import estimation_claims
+from .estimation_tables import estimation_tables
+from .formation_claims import formation_claims
+from .formation_tables import formation_tables
 from .regulation_claims import REGULATION_CLAIMS
 from .results import Section
 from .tables import table_4_1, table_4_2
+from .target_claims import target_claims, target_tables
 from .tracking_claims import TRACKING_CLAIMS
 
 
@@ -22,10 +27,36 @@ def claims_4(jobs: int = 1) -> Section:
     return Section("claims-4", "Claims of chapter 4 (and of section 9.2)", [], claims)
 
 
+def _unprinted(chapter: int) -> str:
+    """Chapters 5 to 7 show figures alone: there are claims to test, and a prototype to compare with."""
+    return (
+        f"Claims of chapter {chapter} (it prints no numbers, its figures are images; "
+        "beside ours those of an independent prototype)"
+    )
+
+
+def claims_5(jobs: int = 1) -> Section:
+    """The claims of chapter 5 on formation flight."""
+    return Section("claims-5", _unprinted(5), formation_tables(jobs), formation_claims(jobs))
+
+
+def claims_6(jobs: int = 1) -> Section:
+    """The claims of chapter 6 on cooperative estimation; batched, so that `jobs` changes nothing."""
+    return Section("claims-6", _unprinted(6), estimation_tables(), estimation_claims())
+
+
+def claims_7(jobs: int = 1) -> Section:
+    """The claims of chapter 7 on both together."""
+    return Section("claims-7", _unprinted(7), target_tables(jobs), target_claims(jobs))
+
+
 SECTIONS: dict[str, Callable[[int], Section]] = {
     "table-4.1": table_4_1,
     "table-4.2": table_4_2,
     "claims-4": claims_4,
+    "claims-5": claims_5,
+    "claims-6": claims_6,
+    "claims-7": claims_7,
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -22,6 +23,20 @@ class Cell(NamedTuple):
         return self.ours / self.printed
 
 
+class Measured(NamedTuple):
+    """A number of which the dissertation prints nothing: that of an independent prototype beside ours."""
+
+    where: str  # "line, constant velocity"
+    quantity: str  # "lag, m"
+    prototype: float
+    ours: float
+
+    @property
+    def difference(self) -> float:
+        """Ours less the prototype's."""
+        return self.ours - self.prototype
+
+
 class Claim(NamedTuple):
     """A sentence of the dissertation, what was measured, and whether it holds."""
 
@@ -29,6 +44,7 @@ class Claim(NamedTuple):
     text: str
     verdict: str  # HOLDS, PARTLY or FALSE, computed from the numbers
     numbers: Mapping[str, float | str]
+    prototype: str = ""  # verdict that an independent prototype led to, where there is one
 
 
 class Section(NamedTuple):
@@ -36,7 +52,7 @@ class Section(NamedTuple):
 
     name: str
     title: str
-    cells: list[Cell]
+    cells: list[Cell] | list[Measured]
     claims: list[Claim]
 
     def to_dict(self) -> dict[str, Any]:
@@ -44,25 +60,52 @@ class Section(NamedTuple):
         return {
             "name": self.name,
             "title": self.title,
-            "cells": [{**cell._asdict(), "ratio": cell.ratio} for cell in self.cells],
-            "claims": [{**claim._asdict(), "numbers": dict(claim.numbers)} for claim in self.claims],
+            "cells": [_cell_to_dict(cell) for cell in self.cells],
+            "claims": [_claim_to_dict(claim) for claim in self.claims],
         }
 
     def __str__(self) -> str:
         parts = [self.title]
-        if self.cells:
+        printed = [cell for cell in self.cells if isinstance(cell, Cell)]
+        measured = [cell for cell in self.cells if isinstance(cell, Measured)]
+        if printed:
             rows = [
                 [cell.where, cell.quantity, f"{cell.printed:.4f}", f"{cell.ours:.4f}", f"{cell.ratio:.3f}"]
-                for cell in self.cells
+                for cell in printed
             ]
             parts.append(format_table(["", "quantity", "printed", "ours", "ratio"], rows))
-            misfit = [abs(cell.ratio - 1.0) for cell in self.cells]
+            misfit = [abs(cell.ratio - 1.0) for cell in printed]
             mean_square = sum(m * m for m in misfit) / len(misfit)
             parts.append(f"relative misfit: rms {mean_square**0.5:.1%}, largest {max(misfit):.1%}")
-        for claim in self.claims:
-            numbers = "; ".join(f"{name}: {_show(value)}" for name, value in claim.numbers.items())
-            parts.append(f"[{claim.verdict}] {claim.text}\n    {numbers}")
+        if measured:
+            rows = [[cell.where, cell.quantity, _show(cell.prototype), _show(cell.ours)] for cell in measured]
+            parts.append(format_table(["", "quantity", "prototype", "ours"], rows))
+        parts += map(_claim_text, self.claims)
         return "\n\n".join(parts)
+
+
+def _cell_to_dict(cell: Cell | Measured) -> dict[str, Any]:
+    """With its ratio or difference, and None for what JSON has no number for."""
+    more = {"ratio": cell.ratio} if isinstance(cell, Cell) else {"difference": cell.difference}
+    return {name: _finite(value) for name, value in {**cell._asdict(), **more}.items()}
+
+
+def _claim_to_dict(claim: Claim) -> dict[str, Any]:
+    said = {**claim._asdict(), "numbers": {name: _finite(value) for name, value in claim.numbers.items()}}
+    if not claim.prototype:
+        del said["prototype"]
+    return said
+
+
+def _finite(value: float | str) -> float | str | None:
+    return value if isinstance(value, str) or math.isfinite(value) else None
+
+
+def _claim_text(claim: Claim) -> str:
+    numbers = "; ".join(f"{name}: {_show(value)}" for name, value in claim.numbers.items())
+    differs = claim.prototype and claim.prototype != claim.verdict
+    aside = f", prototype: {claim.prototype}" if differs else ""
+    return f"[{claim.verdict}{aside}] {claim.text}\n    {numbers}"
 
 
 def _show(value: float | str) -> str:
