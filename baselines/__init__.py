@@ -9,16 +9,19 @@ if TYPE_CHECKING:
     from .benchmark import run_benchmark
     from .comparison import Results
     from .conformance import check_policy
-    from .errors import PolicyCheckError, ResultsError
+    from .errors import CheckpointError, PolicyCheckError, ResultsError, TrainingError
     from .estimate_wrapper import EstimateWrapper
     from .evaluation import Evaluation, evaluate
     from .metrics import Estimate, Record, estimate, measure, paired_difference
     from .policy import Policy, PolicyState, make_policy, policy_options
     from .rollout import Episode, run_episodes
     from .suite import Suite, load_suite
+    from .trained import load_policy, shipped_policies
+    from .training.runs import TrainingResult, train
 
 # Public name -> module; loaded at first use, so that importing the package stays cheap.
 _PUBLIC = {
+    "CheckpointError": "errors",
     "Episode": "rollout",
     "Estimate": "metrics",
     "EstimateWrapper": "estimate_wrapper",
@@ -30,9 +33,12 @@ _PUBLIC = {
     "Results": "comparison",
     "ResultsError": "errors",
     "Suite": "suite",
+    "TrainingError": "errors",
+    "TrainingResult": "training.runs",
     "check_policy": "conformance",
     "estimate": "metrics",
     "evaluate": "evaluation",
+    "load_policy": "trained",
     "load_suite": "suite",
     "make_policy": "policy",
     "measure": "metrics",
@@ -40,9 +46,12 @@ _PUBLIC = {
     "policy_options": "policy",
     "run_benchmark": "benchmark",
     "run_episodes": "rollout",
+    "shipped_policies": "trained",
+    "train": "training.runs",
 }
 
 __all__ = [
+    "CheckpointError",
     "Episode",
     "Estimate",
     "EstimateWrapper",
@@ -54,9 +63,12 @@ __all__ = [
     "Results",
     "ResultsError",
     "Suite",
+    "TrainingError",
+    "TrainingResult",
     "check_policy",
     "estimate",
     "evaluate",
+    "load_policy",
     "load_suite",
     "make_policy",
     "measure",
@@ -64,6 +76,8 @@ __all__ = [
     "policy_options",
     "run_benchmark",
     "run_episodes",
+    "shipped_policies",
+    "train",
 ]
 
 

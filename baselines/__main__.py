@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from .errors import MissingPackageError
 from .options import (
     BenchmarkOptions,
     DoctorOptions,
@@ -15,6 +16,7 @@ from .options import (
     ListOptions,
     Parser,
     ReproduceOptions,
+    TrainOptions,
     add_options,
     read_options,
     refuse_unknown,
@@ -51,6 +53,12 @@ def _benchmark(options: BenchmarkOptions) -> int:
     return commands.benchmark_suite(options)
 
 
+def _train(options: TrainOptions) -> int:
+    from . import train_command
+
+    return train_command.train_one(options)
+
+
 def _reproduce(options: ReproduceOptions) -> int:
     from . import reproduce
 
@@ -67,6 +75,7 @@ COMMANDS: dict[str, Command] = {
     "list": Command(ListOptions, _list),
     "evaluate": Command(EvaluateOptions, _evaluate),
     "benchmark": Command(BenchmarkOptions, _benchmark),
+    "train": Command(TrainOptions, _train),
     "reproduce": Command(ReproduceOptions, _reproduce),
     "doctor": Command(DoctorOptions, _doctor),
 }
@@ -115,6 +124,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _input_errors() -> tuple[type[Exception], ...]:
     """What bad input raises; Gymnasium's own errors if it is loaded at all."""
     kinds: tuple[type[Exception], ...] = (ValueError, TypeError, OSError, MemoryError, OverflowError)
+    kinds = (*kinds, MissingPackageError)
     gymnasium = sys.modules.get("gymnasium")
     return kinds if gymnasium is None else (*kinds, gymnasium.error.Error)
 

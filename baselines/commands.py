@@ -63,6 +63,7 @@ def list_names(options: ListOptions) -> int:
 
     from .policy import TEAM_POLICIES, TRACKING_POLICIES
     from .suite import suite_names
+    from .trained import shipped_policies
 
     if options.name:
         return _list_options(options)
@@ -75,7 +76,14 @@ def list_names(options: ListOptions) -> int:
         found = {"environments": TRACKING, "team_environments": TEAM_KINDS}
         print(
             json.dumps(
-                found | {"policies": policies, "team_policies": team, "suites": suite_names()}, indent=1
+                found
+                | {
+                    "policies": policies,
+                    "team_policies": team,
+                    "trained_policies": shipped_policies(),
+                    "suites": suite_names(),
+                },
+                indent=1,
             )
         )
         return 0
@@ -88,6 +96,7 @@ def list_names(options: ListOptions) -> int:
         ("environments of several vehicles (PettingZoo)", TEAM_KINDS),
         ("policies for one vehicle", policies),
         ("policies for several vehicles", team),
+        ("trained policies", shipped_policies() or {"-": "none; quad-envs train ENV ALGORITHM makes one"}),
         ("suites", suite_names()),
     ):
         print(title)

@@ -15,5 +15,9 @@ class CheckpointError(ValueError):
     """A checkpoint cannot be read or written; the message says why and what to do."""
 
 
+class MissingPackageError(ModuleNotFoundError):
+    """A package of an extra is not installed; the message names the extra."""
+
+
 class TrainingError(RuntimeError):
     """Training cannot go on; the message says at which update and why."""

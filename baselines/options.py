@@ -13,6 +13,10 @@ from typing import Annotated, Any, NoReturn, TypeVar, get_args, get_type_hints
 Options = TypeVar("Options")
 
 
+# What an option is read as; the others are text.
+_KINDS: dict[Any, type[Any]] = {int: int, int | None: int, float | None: float, Path | None: Path}
+
+
 class Positional(str):
     """Help text of an argument without a flag; the help text of a flag is a plain string."""
 
@@ -30,7 +34,7 @@ class EvaluateOptions:
     """Fly one policy in one environment."""
 
     env: Annotated[str, Positional("environment id, as quad/HelixTracking-v0 or quad/Formation-v0")]
-    policy: Annotated[str, Positional("policy, as sdc-nmpc or consensus-mpc")]
+    policy: Annotated[str, Positional("policy, as sdc-nmpc, or the folder of a trained one")]
     episodes: Annotated[int, "number of flights"] = 20
     seed: Annotated[int, "environment seed of the first flight"] = 0
     set: Annotated[list[str], "keyword argument of the environment; JSON, else text"] = field(
@@ -56,6 +60,27 @@ class BenchmarkOptions:
     fresh: Annotated[bool, "discard what the folder holds of an earlier run"] = False
     json: Annotated[bool, "print JSON"] = False
     save_episodes: Annotated[bool, "save every flight to the results folder"] = False
+
+
+@dataclass(frozen=True, slots=True)
+class TrainOptions:
+    """Train a network, judge it while it learns, and leave it as a checkpoint."""
+
+    env: Annotated[str, Positional("environment id, as quad/HelixTracking-v0")]
+    algorithm: Annotated[str, Positional("apg, dagger, ppo, ppo-lagrangian or sac")]
+    seed: Annotated[int, "of everything random"] = 0
+    seconds: Annotated[float | None, "budget in CPU-seconds; the algorithm's own if not given"] = None
+    steps: Annotated[int | None, "budget in environment steps instead"] = None
+    out: Annotated[Path | None, "folder; runs/ALGORITHM-TASK-SEED if not given"] = None
+    set: Annotated[list[str], "keyword argument of the environment; JSON, else text"] = field(
+        default_factory=list
+    )
+    hyper: Annotated[list[str], "hyperparameter of the algorithm; JSON, else text"] = field(
+        default_factory=list
+    )
+    resume: Annotated[bool, "go on with the run in the folder: its weights, counters and curve"] = False
+    fresh: Annotated[bool, "discard the run that is in the folder"] = False
+    json: Annotated[bool, "print JSON"] = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +121,7 @@ def add_options(parser: argparse.ArgumentParser, kind: type[Any]) -> None:
         if hint is bool:
             settings["action"] = "store_true"
         else:
-            settings["type"] = int if hint in (int, int | None) else Path if hint == (Path | None) else str
+            settings["type"] = _KINDS.get(hint, str)
         if not required and not many and entry.default not in (None, "", False):
             settings["help"] += f" (default {entry.default})"
         if positional:
@@ -104,9 +129,7 @@ def add_options(parser: argparse.ArgumentParser, kind: type[Any]) -> None:
         elif many:
             settings |= {"action": "append", "metavar": "KEY=VALUE"}
         elif hint is not bool:
-            settings["metavar"] = (
-                "N" if settings["type"] is int else "FOLDER" if settings["type"] is Path else "NAME"
-            )
+            settings["metavar"] = {int: "N", float: "S", Path: "FOLDER"}.get(settings["type"], "NAME")
         parser.add_argument(entry.name if positional else _flag(entry.name), **settings)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast, runtime_checkable
@@ -11,6 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_envs.names import unknown_name
+
+from .trained import load_policy, names_trained, shipped_policies
 
 if TYPE_CHECKING:  # not at run time: tasks load numba, and `quad-envs list` has to be quick
     from quad_envs.tasks import BaseTask, Task, TeamTask
@@ -175,7 +178,8 @@ def policy_entry(name: str, mission: str | None = None) -> PolicyEntry:
     """
     known = TEAM_POLICIES | TRACKING_POLICIES
     if name not in known:
-        raise ValueError(unknown_name("policy", name, known if mission is None else serving(mission)))
+        names = [*(known if mission is None else serving(mission)), *shipped_policies()]
+        raise ValueError(unknown_name("policy", name, names) + ", or the folder of a trained one")
     if mission is None:
         return known[name]
     able = serving(mission)
@@ -185,6 +189,11 @@ def policy_entry(name: str, mission: str | None = None) -> PolicyEntry:
             f"policy {name!r} is for {serves} tasks, not for {mission}; those that are: {', '.join(able)}"
         )
     return able[name]
+
+
+def is_trained(name: str | os.PathLike[str]) -> bool:
+    """Whether a name is that of a trained policy, and not of a controller."""
+    return name not in TEAM_POLICIES | TRACKING_POLICIES and names_trained(name)
 
 
 def _factory(entry: PolicyEntry) -> Callable[..., Any]:
@@ -218,11 +227,12 @@ def _check_kind(name: str, option: str, value: Any, default: Any) -> None:
         raise ValueError(f"{option} of policy {name!r} must be {kind}, got {value!r} (default {default!r})")
 
 
-def make_policy(name: str, env: Any, **options: Any) -> Policy:
+def make_policy(name: str | os.PathLike[str], env: Any, **options: Any) -> Policy:
     """A policy for a task.
 
     Args:
-        name: One of TRACKING_POLICIES, or for a team one of TEAM_POLICIES.
+        name: One of TRACKING_POLICIES, or for a team one of TEAM_POLICIES; or a trained policy: the folder
+            of its training, or the name of a shipped one.
         env: An environment (wrapped or not), a vector environment, an id, or a Task. Only its Task is used.
         options: Of the policy, see `policy_options`; MPCs take `horizon`, `solver` and what their chapter
             offers. A horizon that is not given is 25, or the preview of the task where that is shorter.
@@ -231,9 +241,15 @@ def make_policy(name: str, env: Any, **options: Any) -> Policy:
     Raises:
         ValueError: If the name, an option or its value is not allowed, the policy is for other tasks, or the
             horizon exceeds the preview.
+        CheckpointError: If a trained policy cannot be read, or is for other tasks.
     """
     from .environments import task_of
 
+    if is_trained(name):
+        if options:
+            raise ValueError(f"a trained policy has no options, got {', '.join(options)}")
+        return load_policy(name, env)
+    name = str(name)
     defaults = policy_options(name)
     for option in options:
         if option not in defaults:

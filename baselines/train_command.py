@@ -1,0 +1,71 @@
+"""What the command `train` does."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+
+from .commands import plain_warnings, say
+from .errors import TrainingError
+from .options import TrainOptions, read_assignments
+from .results import plain_json
+
+_DIVERGED, _INTERRUPTED = 1, 130
+
+
+def train_one(options: TrainOptions) -> int:
+    """Train, print what came out, and leave a checkpoint."""
+    from .training.algorithms import resumable
+    from .training.runs import default_folder, train
+    from .training.watching import Display, describe
+
+    env_kwargs, hyper = read_assignments("--set", options.set), read_assignments("--hyper", options.hyper)
+    out = options.out or default_folder(options.env, options.algorithm, options.seed)
+    display = Display(f"{options.algorithm} on {options.env}")
+    with plain_warnings():
+        try:
+            result = train(
+                options.env,
+                options.algorithm,
+                seed=options.seed,
+                seconds=options.seconds,
+                steps=options.steps,
+                out=out,
+                env_kwargs=env_kwargs,
+                hyper=hyper,
+                resume=options.resume,
+                fresh=options.fresh,
+                watcher=display,
+            )
+        except TrainingError as error:
+            say(f"quad-envs: {error}")
+            return _DIVERGED
+        except KeyboardInterrupt:
+            display.close()
+            if not (out / "policy.json").exists():
+                say("interrupted before the first policy; nothing is saved")
+            elif resumable(options.algorithm):
+                say(f"interrupted; the policy is saved. Resume with: {resume_command(options, out)}")
+            else:
+                say(f"interrupted; the best policy is in {out}. {options.algorithm} cannot be resumed")
+            return _INTERRUPTED
+        finally:
+            display.close()
+    if options.json:
+        print(json.dumps(plain_json(result.to_dict()), indent=1, allow_nan=False))
+    else:
+        print(f"best of {len(result.curve)} evaluations: {describe(result.best)}")
+    say(f"policy in {out}; fly it with: quad-envs evaluate {options.env} {shlex.quote(str(out))}")
+    return 0
+
+
+def resume_command(options: TrainOptions, out: Path) -> str:
+    """The command line that goes on with a run."""
+    words = ["quad-envs train", shlex.quote(options.env), options.algorithm, f"--seed {options.seed}"]
+    words += [] if options.seconds is None else [f"--seconds {options.seconds:g}"]
+    words += [] if options.steps is None else [f"--steps {options.steps}"]
+    words += [f"--out {shlex.quote(str(out))}"]
+    words += [f"--set {shlex.quote(text)}" for text in options.set]
+    words += [f"--hyper {shlex.quote(text)}" for text in options.hyper]
+    return " ".join([*words, "--resume"])

@@ -1,0 +1,88 @@
+"""Trained networks as policies: the folder of a training run, or a shipped one by its name."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from quad_envs.names import unknown_name
+
+from .errors import CheckpointError
+
+if TYPE_CHECKING:
+    from .training.networks import NetworkPolicy
+
+SHIPPED = Path(__file__).parent / "policies"  # one checkpoint per folder, as "apg-helix"
+_DESCRIPTION = "policy.json"
+
+
+def shipped_policies() -> dict[str, str]:
+    """Name -> what it is, of the trained policies that come with the suite; loads none of them."""
+    return {path.parent.name: _describe(path) for path in sorted(SHIPPED.glob(f"*/{_DESCRIPTION}"))}
+
+
+def _describe(path: Path) -> str:
+    said = json.loads(path.read_text(encoding="utf-8"))
+    return f"{said['algorithm']} ({said['kind']}) on {said['env_id']}, score {said['score']:.3f}"
+
+
+def names_trained(name: str | os.PathLike[str]) -> bool:
+    """Whether a name can only be a trained policy: a path, something on disk, or a shipped name."""
+    text = os.fspath(name)
+    return (
+        isinstance(name, os.PathLike)
+        or os.sep in text
+        or "/" in text
+        or (SHIPPED / text / _DESCRIPTION).is_file()
+        or Path(text).exists()
+    )
+
+
+def load_policy(source: str | os.PathLike[str], env: Any) -> NetworkPolicy:
+    """A trained network as a policy; no code of the checkpoint runs, and no torch is needed.
+
+    Args:
+        source: The folder of a training run or checkpoint, or a name of `shipped_policies`.
+        env: As for `make_policy`: where it is to fly.
+
+    Raises:
+        CheckpointError: If it is no checkpoint of this version, or was trained on another kind of task.
+    """
+    from .environments import task_of
+    from .policy import mission_of
+    from .training.checkpoints import load_checkpoint
+    from .training.networks import NetworkPolicy
+
+    folder = _folder(source)
+    network, said = load_checkpoint(folder)
+    task = task_of(env)
+    where, mission = f"checkpoint {str(folder)!r}", said.get("mission")
+    if mission is not None and mission != mission_of(task):
+        raise CheckpointError(
+            f"{where} was trained on {said.get('env_id')}, a {mission} task; {task.env_id} is one of "
+            f"{mission_of(task)}: train one for it with quad-envs train {task.env_id}"
+        )
+    name = os.fspath(source) if folder.parent == SHIPPED else folder.name or str(folder)
+    try:
+        return NetworkPolicy(network, task, name, str(said.get("kind", "")))
+    except ValueError as error:
+        raise CheckpointError(f"{where} does not fit {task.env_id}: {error}") from error
+
+
+def _folder(source: str | os.PathLike[str]) -> Path:
+    """Where the checkpoint is."""
+    text = os.fspath(source)
+    if not isinstance(source, os.PathLike) and (SHIPPED / text / _DESCRIPTION).is_file():
+        return SHIPPED / text
+    path = Path(text)
+    if path.is_file():
+        raise CheckpointError(
+            f"{text!r} is a file; a trained policy is a folder with network.safetensors and {_DESCRIPTION}. "
+            "Zips of Stable-Baselines3 and .pt files of torch are pickles, which are never opened"
+        )
+    if not path.is_dir():
+        shipped = unknown_name("trained policy", text, shipped_policies())
+        raise CheckpointError(f"there is no folder {text!r}, and it is not shipped: {shipped}")
+    return path

@@ -1,0 +1,140 @@
+"""The training algorithms by name. One is a generator; everything around it is in `runs`.
+
+    train(task_options, options, seed, spent, start=None) -> Iterator[tuple[Progress, Network]]
+
+`task_options` are the TrackingOptions or team options of the environment, `options` the algorithm's
+hyperparameters (a frozen dataclass), `spent()` the share of the budget that is used up: the generator ends at
+1, and yields after each update. `start` is a network to go on from, for --resume; a generator without this
+argument cannot be resumed.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any, NamedTuple
+
+from quad_envs.names import unknown_name
+
+from ..errors import MissingPackageError
+
+TRACKING, FORMATION, TARGET, ESTIMATION = "tracking", "formation", "target-tracking", "estimation"
+
+
+class Algorithm(NamedTuple):
+    """A row of the registry."""
+
+    module: str
+    generator: str  # name in the module
+    options: str  # name of the dataclass of its hyperparameters
+    kind: str  # what it knows: "model-free", "imitation" or "model-based"
+    missions: tuple[str, ...]  # on which tasks it can act
+    description: str
+    seconds: float = 60.0  # default budget, CPU-seconds
+    packages: tuple[str, ...] = ("torch",)  # modules that it imports
+
+
+_SB3 = ("torch", "stable_baselines3")
+ALGORITHMS: dict[str, Algorithm] = {
+    "apg": Algorithm(
+        ".policy_gradient",
+        "train",
+        "PolicyGradientOptions",
+        "model-based",
+        (TRACKING,),
+        "analytic policy gradient through the compiled dynamics",
+    ),
+    "dagger": Algorithm(
+        ".imitation",
+        "train",
+        "DaggerOptions",
+        "imitation",
+        (TRACKING, FORMATION),
+        "imitation of an MPC, labelled where the network flies",
+        15.0,
+    ),
+    "ppo": Algorithm(
+        ".sb3",
+        "train_ppo",
+        "PPOOptions",
+        "model-free",
+        (TRACKING, FORMATION, TARGET),
+        "proximal policy optimisation on the shared reward",
+        150.0,
+        _SB3,
+    ),
+    "ppo-lagrangian": Algorithm(
+        ".sb3",
+        "train_ppo_lagrangian",
+        "PPOLagrangianOptions",
+        "model-free",
+        (TRACKING, FORMATION, TARGET),
+        "the same, with a multiplier that holds the share of violating steps under a limit",
+        150.0,
+        _SB3,
+    ),
+    "sac": Algorithm(
+        ".sb3",
+        "train_sac",
+        "SACOptions",
+        "model-free",
+        (TRACKING,),
+        "soft actor-critic on the shared reward",
+        150.0,
+        _SB3,
+    ),
+}
+
+
+def algorithm_for(name: str, mission: str) -> Algorithm:
+    """The row of an algorithm that has to act on a kind of task.
+
+    Raises:
+        ValueError: If there is no such algorithm, or it cannot act there; it names those that can.
+    """
+    if name not in ALGORITHMS:
+        raise ValueError(unknown_name("training algorithm", name, ALGORITHMS))
+    able = [key for key, entry in ALGORITHMS.items() if mission in entry.missions]
+    if name not in able:
+        serves = " and ".join(ALGORITHMS[name].missions)
+        raise ValueError(
+            f"algorithm {name!r} trains on {serves} tasks, not on {mission}; those that can act there: "
+            f"{', '.join(able) if able else 'none, its agents estimate and do not fly'}"
+        )
+    return ALGORITHMS[name]
+
+
+def require_packages(name: str) -> None:
+    """Check that what an algorithm imports is installed.
+
+    Raises:
+        MissingPackageError: If not; the message names the extra.
+    """
+    missing = [package for package in ALGORITHMS[name].packages if find_spec(package) is None]
+    if missing:
+        verb = "is" if len(missing) == 1 else "are"
+        raise MissingPackageError(
+            f"training with {name!r} needs {' and '.join(missing)}, which {verb} not installed: "
+            'pip install "quad-envs[rl]". Trained policies fly without.'
+        )
+
+
+def generator_of(name: str) -> Callable[..., Any]:
+    """The generator function of an algorithm."""
+    entry = ALGORITHMS[name]
+    found: Callable[..., Any] = getattr(import_module(entry.module, __package__), entry.generator)
+    return found
+
+
+def options_of(name: str) -> type[Any]:
+    """The dataclass of an algorithm's hyperparameters."""
+    entry = ALGORITHMS[name]
+    found: type[Any] = getattr(import_module(entry.module, __package__), entry.options)
+    return found
+
+
+def resumable(name: str) -> bool:
+    """Whether an algorithm can go on from a network."""
+    return "start" in inspect.signature(generator_of(name)).parameters

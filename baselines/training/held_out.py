@@ -1,0 +1,97 @@
+"""What training is judged by: the reward, from starts that training never sees, in all flights at once.
+
+Environment seeds from 10 000 on are held out. Those from 20 000 on choose the best policy while training, so
+that those from 10 000 to 19 999 stay untouched for comparisons.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+
+from quad_envs.names import unknown_name
+from quad_envs.registration import TEAMS, TRACKING
+
+from ..evaluation import evaluate
+from .networks import Network, NetworkPolicy
+
+HELD_OUT = 10_000  # the first environment seed that training must not use
+CHOOSING = 20_000  # the first of those that choose the best policy
+_FLIGHTS, _TEAM_FLIGHTS = 20, 5
+
+
+class Point(NamedTuple):
+    """A row of the learning curve."""
+
+    cpu_seconds: float
+    steps: int
+    updates: int
+    score: float  # mean over the held-out flights
+    cost: float  # mean summed quadratic cost; nan if a flight crashed
+    violation_share: float  # of the steps
+    crashes: int  # flights (of a team: vehicles) that crashed
+    flights: int
+    training_reward: float  # mean of the last update, as the algorithm saw it
+
+
+def training_options(env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
+    """The options of an environment as a value, from its id and keyword arguments.
+
+    Raises:
+        ValueError: If the id or an argument is unknown or not allowed.
+    """
+    name = env_id.removeprefix("quad_envs:")
+    try:
+        if name in TEAMS:
+            return import_module(TEAMS[name]).raw_env.options_type.from_kwargs(env_kwargs)
+        from quad_envs.envs.options import TrackingOptions
+
+        if name in TRACKING:
+            return TrackingOptions.from_kwargs({"env_id": name, **TRACKING[name], **env_kwargs})
+    except TypeError as error:
+        raise ValueError(str(error)) from error
+    raise ValueError(unknown_name("environment id", env_id, [*TRACKING, *TEAMS]))
+
+
+class HeldOutFlights:
+    """Flights from held-out starts, of one task."""
+
+    def __init__(self, env_id: str, env_kwargs: Mapping[str, Any]) -> None:
+        name = env_id.removeprefix("quad_envs:")
+        self.flights = _TEAM_FLIGHTS if name in TEAMS else _FLIGHTS
+        if name in TEAMS:
+            self.env: Any = import_module(TEAMS[name]).vector_env(self.flights, **env_kwargs)
+        else:
+            self.env = gymnasium.make_vec(name, num_envs=self.flights, **env_kwargs)
+        self.task = self.env.unwrapped.task
+
+    def judge(self, network: Network, cpu_seconds: float, progress: Any) -> Point:
+        """Fly a network."""
+        found = evaluate(NetworkPolicy(network, self.task, "training"), self.env, self.flights, CHOOSING)
+        summary = found.summary()
+        return Point(
+            cpu_seconds=cpu_seconds,
+            steps=int(progress.steps),
+            updates=int(progress.update),
+            score=summary["score"].mean,
+            cost=summary["cost"].mean,
+            violation_share=summary["violation_share"].mean,
+            crashes=int(np.sum([record.crashed for record in found.records])),
+            flights=len(found.records),
+            training_reward=float(progress.reward),
+        )
+
+
+def better(point: Point, best: Point | None, limit: float | None = None) -> bool:
+    """Whether a policy is better: the higher score, among those under the limit of violating steps if any."""
+    if best is None:
+        return True
+    if limit is not None:
+        over, over_best = max(0.0, point.violation_share - limit), max(0.0, best.violation_share - limit)
+        if over != over_best:
+            return over < over_best
+    return point.score > best.score

@@ -1,0 +1,88 @@
+"""Hyperparameters: the defaults of an algorithm, its committed TOML file, and what the caller overrides.
+
+hyperparameters/ALGORITHM.toml has a table [default] and one per id, each only with what differs from the
+table before it; the first of them are the defaults of the options dataclass.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import MISSING, asdict, fields
+from importlib import resources
+from typing import Any
+
+from quad_envs.names import unknown_name
+
+from .algorithms import options_of
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+
+def hyperparameter_file(algorithm: str) -> dict[str, dict[str, Any]]:
+    """The tables of an algorithm's file; empty without one."""
+    file = resources.files(__package__).joinpath("hyperparameters", f"{algorithm}.toml")
+    if not file.is_file():
+        return {}
+    tables = tomllib.loads(file.read_text(encoding="utf-8"))
+    return {name: dict(values) for name, values in tables.items()}
+
+
+def hyperparameters(algorithm: str, env_id: str, overrides: Mapping[str, Any] | None = None) -> Any:
+    """The options of an algorithm for a task.
+
+    Args:
+        algorithm: Its name.
+        env_id: The task; one without a table of its own gets the defaults.
+        overrides: What the caller chooses instead.
+
+    Raises:
+        ValueError: If a name or value is not allowed; the message suggests the nearest name.
+    """
+    kind, tables = options_of(algorithm), hyperparameter_file(algorithm)
+    values: dict[str, Any] = {}
+    sources = [(f"[{name}] of {algorithm}.toml", tables.get(name, {})) for name in ("default", env_id)]
+    for source, table in (*sources, ("given", overrides or {})):
+        values |= {name: _checked(kind, algorithm, name, value, source) for name, value in table.items()}
+    try:
+        return kind(**values)
+    except TypeError as error:
+        raise ValueError(f"hyperparameters of {algorithm!r}: {error}") from error
+
+
+def plain_options(options: Any) -> dict[str, Any]:
+    """Options as values of JSON."""
+    return {
+        name: list(value) if isinstance(value, tuple) else value for name, value in asdict(options).items()
+    }
+
+
+def _checked(kind: type[Any], algorithm: str, name: str, value: Any, source: str) -> Any:
+    """A value as its field wants it."""
+    known = {entry.name: entry for entry in fields(kind)}
+    if name not in known:
+        raise ValueError(f"{unknown_name(f'hyperparameter of {algorithm!r}', name, known)} ({source})")
+    default = known[name].default
+    if default is MISSING or default is None or value is None:
+        return tuple(value) if isinstance(value, list) else value
+    if isinstance(default, tuple):
+        fits, wanted = isinstance(value, list | tuple), "a list"
+        value = tuple(value) if fits else value
+    elif isinstance(default, bool):
+        fits, wanted = isinstance(value, bool), "true or false"
+    elif isinstance(default, int):
+        fits, wanted = isinstance(value, int) and not isinstance(value, bool), "a whole number"
+    elif isinstance(default, float):
+        fits, wanted = isinstance(value, int | float) and not isinstance(value, bool), "a number"
+        value = float(value) if fits else value
+    else:
+        fits, wanted = isinstance(value, type(default)), "text"
+    if not fits:
+        raise ValueError(
+            f"hyperparameter {name} of {algorithm!r} must be {wanted}, got {value!r} ({source}; "
+            f"default {default!r})"
+        )
+    return value

@@ -1,0 +1,133 @@
+"""The folder of a training run.
+
+network.safetensors, policy.json    the best policy, so that the folder itself is a checkpoint
+last/                               the last policy, from which --resume goes on
+curve.csv                           one row per evaluation
+config.json                         task, algorithm, seed, hyperparameters, versions, revision, command
+tensorboard/                        its log, where TensorBoard is installed
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from ..errors import ResultsError
+from ..results import plain_json, provenance, read_json, write_atomic, write_csv
+from .checkpoints import DESCRIPTION, WEIGHTS, load_checkpoint, save_checkpoint
+from .held_out import Point
+from .networks import Network
+
+_IDENTITY = ("env_id", "env_kwargs", "algorithm", "seed", "hyperparameters")  # a resumed run must agree
+_FILES = (WEIGHTS, DESCRIPTION, "curve.csv", "config.json")
+
+
+class RunFolder:
+    """Writes and reads the folder of a run. Use it under `results.locked`.
+
+    Args:
+        path: The folder.
+        about: Task, algorithm, seed and hyperparameters, as in config.json.
+    """
+
+    def __init__(self, path: Path, about: Mapping[str, Any]) -> None:
+        self.path, self.about = path, dict(about)
+
+    @property
+    def last(self) -> Path:
+        """Where the last policy is."""
+        return self.path / "last"
+
+    def begin(self, fresh: bool) -> None:
+        """Make the folder ready for a new run.
+
+        Raises:
+            ResultsError: If it holds an earlier run and `fresh` is False, or files that no training wrote.
+        """
+        found = self._config()
+        if found is None:
+            foreign = [name for name in _FILES if (self.path / name).exists()]
+            if foreign:
+                raise ResultsError(
+                    f"{str(self.path)!r} holds a {foreign[0]} that no training has written; choose another "
+                    "folder, or move it away"
+                )
+        elif not fresh:
+            raise ResultsError(
+                f"{str(self.path)!r} holds a training of {found['algorithm']} on {found['env_id']}, seed "
+                f"{found['seed']}: go on with it (--resume), discard it (--fresh), or choose another folder"
+            )
+        else:
+            for name in _FILES:
+                (self.path / name).unlink(missing_ok=True)
+            for name in ("last", "tensorboard"):
+                shutil.rmtree(self.path / name, ignore_errors=True)
+        self.write_config([])
+
+    def resume(self) -> tuple[Network, dict[str, Any], list[Point]]:
+        """The last network, what policy.json says of it, and the curve so far.
+
+        Raises:
+            ResultsError: If there is no run, or it is another one.
+            CheckpointError: If its last policy cannot be read.
+        """
+        found = self._config()
+        if found is None:
+            raise ResultsError(
+                f"{str(self.path)!r} holds no training that could be resumed; leave --resume out"
+            )
+        asked = plain_json(self.about)
+        differing = [name for name in _IDENTITY if found.get(name) != asked.get(name)]
+        if differing:
+            name = differing[0]
+            raise ResultsError(
+                f"{str(self.path)!r} holds another training: its {name} is {json.dumps(found.get(name))}, "
+                f"asked for is {json.dumps(asked.get(name))}; give the same, or choose another folder"
+            )
+        network, described = load_checkpoint(self.last)
+        self.write_config([*found.get("commands", []), found.get("command")])
+        return network, described, self.read_curve()
+
+    def save_best(self, network: Network, about: Mapping[str, Any]) -> None:
+        """Write the best policy."""
+        save_checkpoint(self.path, network, {**plain_json(self.about), **plain_json(about)})
+
+    def save_last(self, network: Network, about: Mapping[str, Any]) -> None:
+        """Write the last policy."""
+        save_checkpoint(self.last, network, {**plain_json(self.about), **plain_json(about)})
+
+    def write_curve(self, points: Sequence[Point]) -> None:
+        """Write the whole curve."""
+        if points:
+            write_csv(self.path / "curve.csv", [point._asdict() for point in points])
+
+    def read_curve(self) -> list[Point]:
+        """The curve so far; empty if there is none."""
+        path, points = self.path / "curve.csv", []
+        kinds = {name: int if kind == "int" else float for name, kind in Point.__annotations__.items()}
+        with suppress(FileNotFoundError, ValueError, TypeError, KeyError), open(path, newline="") as file:
+            for row in csv.DictReader(file):
+                values: dict[str, Any] = {name: kind(row[name] or "nan") for name, kind in kinds.items()}
+                points.append(Point(**values))
+        return points
+
+    def write_config(self, commands: Sequence[Any]) -> None:
+        """Write config.json; `commands` are those of earlier sessions of this run."""
+        found = {"training": 1, **plain_json(self.about), **provenance(), "commands": list(commands)}
+        write_atomic(self.path / "config.json", (json.dumps(found, indent=1) + "\n").encode())
+
+    def _config(self) -> dict[str, Any] | None:
+        path = self.path / "config.json"
+        if not path.exists():
+            return None
+        found = read_json(path)
+        if isinstance(found, dict) and found.get("training") and all(name in found for name in _IDENTITY):
+            return found
+        raise ResultsError(
+            f"{str(self.path)!r} holds a config.json that no training has written; choose another folder"
+        )

@@ -1,0 +1,356 @@
+"""`train`: any algorithm on any task it can act on, with a budget, a learning curve and checkpoints.
+
+Nothing here knows an algorithm: each is a generator, see `algorithms`.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..errors import CheckpointError, ResultsError, TrainingError
+from ..policy import mission_of
+from ..results import locked
+from .algorithms import ALGORITHMS, algorithm_for, generator_of, require_packages, resumable
+from .clock import Budget, TrainingClock
+from .held_out import CHOOSING, HeldOutFlights, Point, better, training_options
+from .hyperparameters import hyperparameters, plain_options
+from .networks import Network
+from .run_folder import RunFolder
+from .watching import Watcher, tensorboard_log
+
+_EVALUATIONS = 30  # in a budget
+_PAUSE = 0.5  # CPU-seconds between evaluations, at least, in a budget of seconds
+_SEEDS = 5_000  # training seeds lie below; rows of a vector environment count on from there
+_LIMIT = "limit"  # hyperparameter that bounds the share of violating steps
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingResult:
+    """What a training gave."""
+
+    folder: Path  # a checkpoint itself, of the best policy
+    env_id: str
+    algorithm: str
+    seed: int
+    best: Point
+    curve: tuple[Point, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain values."""
+        return {
+            "folder": str(self.folder),
+            "env": self.env_id,
+            "algorithm": self.algorithm,
+            "seed": self.seed,
+            "best": self.best._asdict(),
+            "curve": [point._asdict() for point in self.curve],
+        }
+
+
+class _Start(NamedTuple):
+    """From where a training goes on; all zero for a new one."""
+
+    network: Network | None = None
+    seconds: float = 0.0
+    steps: int = 0
+    updates: int = 0
+    resumed: int = 0  # times
+    curve: tuple[Point, ...] = ()
+    best: Point | None = None
+
+
+def default_folder(env_id: str, algorithm: str, seed: int) -> Path:
+    """Where a training goes if no folder is named."""
+    task = env_id.rsplit("/", 1)[-1].removesuffix("-v0")
+    return Path("runs") / f"{algorithm}-{task}-{seed}"
+
+
+def train(
+    env_id: str,
+    algorithm: str,
+    *,
+    seed: int = 0,
+    seconds: float | None = None,
+    steps: int | None = None,
+    out: str | Path | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+    hyper: Mapping[str, Any] | None = None,
+    resume: bool = False,
+    fresh: bool = False,
+    watcher: Watcher | None = None,
+) -> TrainingResult:
+    """Train a network, and leave a folder that is a checkpoint of the best one.
+
+    Equal seeds and a budget in steps give equal runs; one in CPU-seconds ends where the machine's speed has
+    it end. Ctrl-C saves and is raised again.
+
+    Args:
+        env_id: Id of the task.
+        algorithm: One of `ALGORITHMS`.
+        seed: Of everything random, 0 to 4 999.
+        seconds: Budget in CPU-seconds, without compilation and evaluation; the algorithm's own if neither
+            this nor `steps` is given.
+        steps: Budget in environment steps instead.
+        out: Folder; `default_folder` if not given.
+        env_kwargs: Of the environment.
+        hyper: Hyperparameters that differ from the committed ones.
+        resume: Go on with the run in the folder until the whole budget is used. The weights, the counters,
+            the learning rate's place in its schedule and the curve are restored; the optimiser's averages,
+            a critic, collected data and the random streams begin anew.
+        fresh: Discard the run that is in the folder.
+        watcher: Hears of the progress.
+
+    Raises:
+        ValueError: If an argument is not allowed or the algorithm cannot act on the task.
+        MissingPackageError: If what the algorithm needs is not installed.
+        ResultsError: If the folder is in use, holds another run, or cannot be written.
+        CheckpointError: If a policy cannot be written or read.
+        TrainingError: If training diverges; the last good policies are kept.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < _SEEDS:
+        raise ValueError(
+            f"seed of a training must be a whole number, 0 to {_SEEDS - 1}, got {seed!r}; later ones are "
+            "held out for evaluation"
+        )
+    if resume and fresh:
+        raise ValueError("either resume or fresh: a run that is discarded cannot go on")
+    kwargs = dict(env_kwargs or {})
+    task_options = training_options(env_id, kwargs)
+    entry = algorithm_for(algorithm, mission_of(task_options.make_task()))
+    budget = Budget(entry.seconds if seconds is None and steps is None else seconds, steps)
+    require_packages(algorithm)
+    options = hyperparameters(algorithm, env_id.removeprefix("quad_envs:"), hyper)
+    path = default_folder(env_id, algorithm, seed) if out is None else Path(out)
+    about = {
+        "env_id": env_id.removeprefix("quad_envs:"),
+        "env_kwargs": {key: value if _is_plain(value) else repr(value) for key, value in kwargs.items()},
+        "mission": mission_of(task_options.make_task()),
+        "algorithm": algorithm,
+        "kind": entry.kind,
+        "seed": seed,
+        "hyperparameters": plain_options(options),
+    }
+    held_out = HeldOutFlights(env_id, kwargs)
+    with locked(path):
+        folder = RunFolder(path, about)
+        if resume:
+            start = _resume(folder, algorithm, budget)
+        else:
+            folder.begin(fresh)
+            start = _Start()
+        run = _Run(folder, budget, held_out, start, getattr(options, _LIMIT, None), watcher)
+        run.go(algorithm, task_options, options, seed)
+        return TrainingResult(path, env_id, algorithm, seed, run.best_point(), tuple(run.curve))
+
+
+def _is_plain(value: Any) -> bool:
+    if isinstance(value, list | tuple):
+        return all(map(_is_plain, value))
+    if isinstance(value, dict):
+        return all(map(_is_plain, value.values()))
+    return value is None or isinstance(value, str | int | float)
+
+
+def _resume(folder: RunFolder, algorithm: str, budget: Budget) -> _Start:
+    """Where the run in the folder stands."""
+    if not resumable(algorithm):
+        raise ValueError(
+            f"{algorithm!r} cannot go on from a saved network: its critic and its data are not saved; train "
+            "anew with a larger budget (--fresh)"
+        )
+    network, said, curve = folder.resume()
+    try:
+        start = _Start(
+            network,
+            float(said["cpu_seconds"]),
+            int(said["steps"]),
+            int(said["updates"]),
+            int(said["resumed"]) + 1,
+            tuple(curve),
+            Point(**said["best"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise ResultsError(
+            f"{str(folder.last)!r} does not say how far the training was: {error!r}"
+        ) from error
+    if budget.share(start.seconds, start.steps) >= 1.0:
+        raise ResultsError(
+            f"{str(folder.path)!r} has used {start.seconds:.1f} CPU-seconds and {start.steps} steps, all of "
+            f"{budget}: give more, with --seconds or --steps for the whole run"
+        )
+    return start
+
+
+class _Progress(NamedTuple):
+    """Of the whole run, earlier sessions included."""
+
+    update: int
+    steps: int
+    reward: float
+
+
+class _Run:
+    """One session of training: turns the generator, judges now and then, saves."""
+
+    def __init__(
+        self,
+        folder: RunFolder,
+        budget: Budget,
+        held_out: HeldOutFlights,
+        start: _Start,
+        limit: float | None,
+        watcher: Watcher | None,
+    ) -> None:
+        self.folder, self.budget, self.held_out, self.start, self.limit = (
+            folder,
+            budget,
+            held_out,
+            start,
+            limit,
+        )
+        self.curve: list[Point] = list(start.curve)
+        self.best = start.best
+        self.clock = TrainingClock(start.seconds)
+        self.progress = _Progress(start.updates, start.steps, math.nan)
+        self.network: Network | None = None  # the last one that is not saved yet
+        self._judged = -math.inf  # CPU-seconds at the last evaluation
+        self._next = 0.0  # share of the budget at which the next one is due
+        self._watchers: list[Watcher] = [] if watcher is None else [watcher]
+        self._unsaved: CheckpointError | ResultsError | None = None
+
+    def best_point(self) -> Point:
+        """The best evaluation."""
+        assert self.best is not None
+        return self.best
+
+    def go(self, algorithm: str, task_options: Any, options: Any, seed: int) -> None:
+        """Train until the budget is used up."""
+        more = {"start": self.start.network} if self.start.network is not None else {}
+        # A resumed run draws other flights than those it has seen.
+        seed += 1_000_003 * self.start.resumed
+        with _one_thread():
+            updates = generator_of(algorithm)(task_options, options, seed, self.share, **more)
+            self._watchers += tensorboard_log(self.folder.path / "tensorboard")
+            try:
+                self._turn(updates)
+            finally:
+                updates.close()
+                self._end()
+        if self._unsaved is not None:
+            raise self._unsaved
+        if self.best is None:
+            raise TrainingError(f"{algorithm} made no update within {self.budget}; give it more")
+
+    def share(self) -> float:
+        """Share of the budget that is used up."""
+        return self.budget.share(self.clock.seconds, self.progress.steps)
+
+    def _turn(self, updates: Iterator[tuple[Any, Network]]) -> None:
+        """Update after update."""
+        while True:
+            try:
+                with self.clock.running():
+                    found = next(updates, None)
+            except (TrainingError, FloatingPointError, ValueError) as error:
+                if self.network is None and not isinstance(error, TrainingError):
+                    raise
+                raise TrainingError(self._diverged(error)) from error
+            if found is None:
+                return
+            progress, self.network = found
+            self.progress = _Progress(
+                self.start.updates + progress.update,
+                self.start.steps + progress.steps,
+                float(progress.reward),
+            )
+            if not math.isfinite(self.progress.reward):
+                raise TrainingError(self._diverged(f"the reward is {self.progress.reward}"))
+            share = self.share()
+            for watcher in self._watchers:
+                watcher.updated(share, self.progress)
+            if self._due(share):
+                self._judge()
+
+    def _due(self, share: float) -> bool:
+        """Whether to evaluate; in a budget of steps at fixed steps, so that equal seeds give equal runs."""
+        if share < self._next or share >= 1.0:  # the end is judged when all is done
+            return False
+        return self.budget.steps is not None or self.clock.seconds - self._judged >= _PAUSE
+
+    def _judge(self) -> None:
+        """Evaluate the network, and save it."""
+        assert self.network is not None
+        point = self.held_out.judge(self.network, self.clock.seconds, self.progress)
+        self._judged, self._next = point.cpu_seconds, self.share() + 1.0 / _EVALUATIONS
+        self.curve.append(point)
+        best = better(point, self.best, self.limit)
+        if best:
+            self.best = point
+        for watcher in self._watchers:
+            watcher.judged(point, best)
+        about = self._about(point)
+        try:
+            if best:
+                self.folder.save_best(self.network, about)
+            self.folder.save_last(self.network, about)
+            self.folder.write_curve(self.curve)
+            self._unsaved = None
+        except (CheckpointError, ResultsError) as error:
+            # Training may outlive a full disk; what was saved before is still whole.
+            self._unsaved = error
+            for watcher in self._watchers:
+                watcher.noted(f"not saved, training goes on: {error}")
+
+    def _about(self, point: Point) -> dict[str, Any]:
+        """What a checkpoint says of its making."""
+        assert self.best is not None
+        return {
+            **point._asdict(),
+            "starts": {"seed": CHOOSING, "flights": self.held_out.flights},
+            "budget": str(self.budget),
+            "resumed": self.start.resumed,
+            "best": self.best._asdict(),
+            "command": sys.argv,
+        }
+
+    def _end(self) -> None:
+        """Judge and save what was not, however training ended."""
+        try:
+            if self.network is not None and (
+                not self.curve or self.curve[-1].updates != self.progress.update
+            ):
+                self._judge()
+        finally:
+            for watcher in self._watchers:
+                watcher.close()
+
+    def _diverged(self, why: Any) -> str:
+        kept = "nothing was learned before"
+        if self.network is not None:
+            kept = f"the best policy before and the last finite one are kept in {str(self.folder.path)!r}"
+        return f"training stopped at update {self.progress.update + 1}: {why}; {kept}"
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Networks this small train faster on one thread, and CPU-seconds compare."""
+    import torch
+
+    torch.optim.Adam([torch.zeros(1, requires_grad=True)])  # imports two more seconds of torch, once
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def algorithm_names() -> Sequence[str]:
+    """Names that `train` knows."""
+    return tuple(ALGORITHMS)
