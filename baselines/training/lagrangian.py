@@ -1,0 +1,71 @@
+"""A bound on the share of violating steps as a Lagrange multiplier on the reward.
+
+Maximise E[sum r_t] such that the share of violating steps is at most `limit`. Steps that a crash takes away
+count as violating, so that the penalised reward is
+
+    (r + m (1 - c)) / (1 + m),   c = 1 in a violating step, else 0,   m >= 0 the multiplier:
+
+it stays in [0, 1], and however large m gets, crashing early never pays.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnvWrapper
+
+from .networks import Floats
+from .vec_env import Bools, TrainingVecEnv
+
+
+class Multiplier:
+    """Proportional-integral ascent on the multiplier (Stooke, Achiam and Abbeel, 2020).
+
+    Args:
+        limit: Of the share of violating steps.
+        proportional: Multiplier per share above the limit.
+        integral: The same, per update.
+    """
+
+    def __init__(self, limit: float, proportional: float, integral: float) -> None:
+        if not 0.0 <= limit <= 1.0:
+            raise ValueError(f"limit is a share of steps, 0 to 1, got {limit!r}")
+        if not (proportional >= 0.0 and integral > 0.0):
+            raise ValueError(
+                f"a multiplier needs proportional >= 0 and integral > 0, got {proportional!r}, {integral!r}"
+            )
+        self.limit, self.proportional, self.integral = limit, proportional, integral
+        self.value, self._sum = 0.0, 0.0
+
+    def update(self, share: float) -> None:
+        """Rise where the share of violating steps is above the limit, fall where it is below."""
+        error = share - self.limit
+        self._sum = max(0.0, self._sum + self.integral * error)
+        self.value = max(0.0, self._sum + self.proportional * error)
+
+
+class LagrangianEnv(VecEnvWrapper):
+    """Flights whose rewards pay for violations.
+
+    Args:
+        venv: The flights.
+        multiplier: Read at every step.
+    """
+
+    def __init__(self, venv: TrainingVecEnv, multiplier: Multiplier) -> None:
+        super().__init__(venv)
+        self.flights, self.multiplier = venv, multiplier
+
+    def reset(self) -> Floats:
+        """Begin all episodes."""
+        return self.flights.reset()
+
+    def step_wait(self) -> tuple[Floats, Floats, Bools, list[dict[str, Any]]]:
+        """One control period, with penalised rewards."""
+        observations, rewards, dones, infos = self.flights.step_wait()
+        m = self.multiplier.value
+        penalised = (rewards + m * ~self.flights.violated) / (1.0 + m)
+        # A crash ends the episode with nothing, whether it violated a limit or not.
+        penalised[rewards <= 0.0] = 0.0
+        return observations, penalised.astype(np.float32), dones, infos

@@ -1,0 +1,318 @@
+"""PPO, PPO-Lagrangian and SAC of stable-baselines3 on the suite's own batched environments: model-free.
+
+The reward that trains is THE reward. Seeds give equal runs. Torch and stable-baselines3 are needed here only:
+what comes out is a `Network`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import VecEnv
+
+from quad_envs.envs.team_options import TeamOptions
+
+from ..errors import TrainingError
+from .lagrangian import LagrangianEnv, Multiplier
+from .learner import RowBuffer, Tanh
+from .networks import Features, Network, default_features
+from .policy_gradient import Progress
+from .vec_env import TaskOptions, TrainingVecEnv
+
+_NEVER = 2**31  # updates between logs of stable-baselines3; runs keep their own
+
+
+@dataclass(frozen=True, slots=True)
+class PpoOptions:
+    """Hyperparameters of PPO."""
+
+    rows: int = 512  # flights, or vehicles of all teams
+    horizon: int = 32  # steps of each row in an update
+    batch: int = 4096
+    epochs: int = 5
+    learning_rate: float = 1e-3
+    final_rate: float = 0.05  # share of the learning rate at the end of the budget
+    discount: float = 0.99
+    trace: float = 0.98  # lambda of the advantage estimate
+    clip: float = 0.2  # of the ratio of probabilities
+    log_std: float = -2.0  # at the start
+    entropy: float = 0.0  # weight of the entropy bonus
+    gradient_norm: float = 0.5  # to which gradients are clipped
+    hidden: tuple[int, ...] = (64, 64)
+    stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for the usual ones
+    critic_updates: int = 5  # of the critic alone, where training goes on from a policy
+
+
+@dataclass(frozen=True, slots=True)
+class PpoLagrangianOptions(PpoOptions):
+    """Hyperparameters of PPO with a bound on the share of violating steps."""
+
+    limit: float = 0.01  # of the share of violating steps in training
+    proportional: float = 1.0  # multiplier per share above the limit
+    integral: float = 0.5  # the same, per update
+
+
+@dataclass(frozen=True, slots=True)
+class SacOptions:
+    """Hyperparameters of SAC."""
+
+    rows: int = 64
+    gradient_steps: int = 8  # for each step of all rows
+    batch: int = 512
+    memory: int = 500_000  # steps in the replay buffer
+    warm_up: int = 5_000  # steps of random actions
+    learning_rate: float = 1e-3
+    final_rate: float = 0.1  # share of the learning rate at the end of the budget
+    discount: float = 0.98
+    smoothing: float = 0.01  # of the target critics
+    hidden: tuple[int, ...] = (64, 64)
+    stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for the usual ones
+    horizon: int = 64  # steps of each row between two reports
+
+
+def train_ppo(
+    task_options: TaskOptions,
+    options: PpoOptions,
+    seed: int,
+    spent: Callable[[], float],
+    start: Network | None = None,
+) -> Iterator[tuple[Progress, Network]]:
+    """Train with PPO; all vehicles of a team share the network.
+
+    Args:
+        task_options: Of the environment.
+        options: Hyperparameters.
+        seed: Of everything random.
+        spent: Share of the budget that is used up, 0 to 1; training ends at 1.
+        start: Policy to go on from. Its critic and its noise are not known: the critic learns anew, and the
+            policy stands still for the first `critic_updates`.
+
+    Yields:
+        After each update, how far it is and the policy without its noise.
+
+    Raises:
+        ValueError: If actions of the task are no rotor commands, or `start` has other layers.
+        TrainingError: If a loss or a weight is not finite.
+    """
+    flights = make_flights(task_options, options, seed, start)
+    model = make_ppo(flights, options, seed, spent)
+    yield from _updates(model, flights, options, spent, start)
+
+
+def train_ppo_lagrangian(
+    task_options: TaskOptions,
+    options: PpoLagrangianOptions,
+    seed: int,
+    spent: Callable[[], float],
+    start: Network | None = None,
+) -> Iterator[tuple[Progress, Network]]:
+    """Train with PPO under a bound on the share of violating steps; otherwise as `train_ppo`.
+
+    Raises:
+        ValueError: If the task has no limits, or its actions are no rotor commands.
+        TrainingError: If a loss or a weight is not finite.
+    """
+    flights = make_flights(task_options, options, seed, start)
+    if not flights.task.constraint_names:
+        raise ValueError(
+            f"{flights.task.env_id} has no limits that ppo-lagrangian could keep: train with ppo, or set "
+            "tilt_limit, velocity_limit, position_limit or rate_limit"
+        )
+    multiplier = Multiplier(options.limit, options.proportional, options.integral)
+    model = make_ppo(LagrangianEnv(flights, multiplier), options, seed, spent)
+    yield from _updates(model, flights, options, spent, start, multiplier)
+
+
+def train_sac(
+    task_options: TaskOptions,
+    options: SacOptions,
+    seed: int,
+    spent: Callable[[], float],
+    start: Network | None = None,
+) -> Iterator[tuple[Progress, Network]]:
+    """Train with SAC, on tasks of one vehicle; otherwise as `train_ppo`.
+
+    Raises:
+        ValueError: If the task is one of several vehicles.
+        TrainingError: If a loss or a weight is not finite.
+    """
+    if isinstance(task_options, TeamOptions):
+        raise ValueError(
+            f"sac cannot act in {task_options.env_id}, a PettingZoo task of several vehicles: its replay "
+            "would mix what neighbours did while they learned; ppo and ppo-lagrangian train there"
+        )
+    flights = make_flights(task_options, options, seed, start)
+    model = make_sac(flights, options, seed, spent)
+    yield from _updates(model, flights, options, spent, start)
+
+
+def make_flights(
+    task_options: TaskOptions, options: PpoOptions | SacOptions, seed: int, start: Network | None = None
+) -> TrainingVecEnv:
+    """Flights to train on: as many teams as make about `rows` vehicles, or `rows` single ones."""
+    size = task_options.vehicles if isinstance(task_options, TeamOptions) else 1
+    features = default_features(task_options.make_task().layout, options.stages)
+    if start is not None:
+        features = start.features
+    return TrainingVecEnv(task_options, max(1, options.rows // size), seed, features=features)
+
+
+def make_ppo(env: VecEnv, options: PpoOptions, seed: int, spent: Callable[[], float]) -> PPO:
+    """The learner, not yet trained."""
+    samples = env.num_envs * options.horizon
+    model = PPO(
+        "MlpPolicy",
+        env,
+        learning_rate=_falling(options.learning_rate, options.final_rate, spent),
+        n_steps=options.horizon,
+        batch_size=math.ceil(samples / max(1, round(samples / options.batch))),
+        n_epochs=options.epochs,
+        gamma=options.discount,
+        gae_lambda=options.trace,
+        clip_range=options.clip,
+        ent_coef=options.entropy,
+        max_grad_norm=options.gradient_norm,
+        policy_kwargs={
+            "net_arch": list(options.hidden),
+            "activation_fn": Tanh,
+            "log_std_init": options.log_std,
+            "optimizer_kwargs": {"eps": 1e-5, "fused": True},
+        },
+        rollout_buffer_class=RowBuffer,
+        seed=seed,
+        device="cpu",
+    )
+    model.set_logger(Logger(None, []))
+    return model
+
+
+def make_sac(env: VecEnv, options: SacOptions, seed: int, spent: Callable[[], float]) -> SAC:
+    """The learner, not yet trained."""
+    model = SAC(
+        "MlpPolicy",
+        env,
+        learning_rate=_falling(options.learning_rate, options.final_rate, spent),
+        buffer_size=options.memory,
+        learning_starts=options.warm_up,
+        batch_size=options.batch,
+        gamma=options.discount,
+        tau=options.smoothing,
+        train_freq=1,
+        gradient_steps=options.gradient_steps,
+        ent_coef="auto_0.01",
+        policy_kwargs={
+            "net_arch": list(options.hidden),
+            "activation_fn": Tanh,
+            "optimizer_kwargs": {"fused": True},
+        },
+        seed=seed,
+        device="cpu",
+    )
+    model.set_logger(Logger(None, []))
+    return model
+
+
+def export(model: PPO | SAC, features: Features) -> Network:
+    """The policy without its noise.
+
+    Args:
+        model: With tanh layers.
+        features: That it sees.
+    """
+    layers = _policy_layers(model)
+    return Network(
+        features,
+        tuple(np.ascontiguousarray(layer.weight.detach().numpy().T) for layer in layers),
+        tuple(layer.bias.detach().numpy().copy() for layer in layers),
+        squash="tanh" if isinstance(model, SAC) else "clip",
+    )
+
+
+def take_over(model: PPO | SAC, network: Network) -> None:
+    """Give a learner the policy of a network.
+
+    Raises:
+        ValueError: If the network has other layers.
+    """
+    layers = _policy_layers(model)
+    wanted = [(layer.in_features, layer.out_features) for layer in layers]
+    found = [tuple(W.shape) for W in network.weights]
+    squash = "tanh" if isinstance(model, SAC) else "clip"
+    if found != wanted or network.squash != squash or network.commands != "hover":
+        raise ValueError(
+            f"the network has layers {found} and squash {network.squash!r}, this training {wanted} and "
+            f"{squash!r}: go on with the algorithm and the hidden layers that made it"
+        )
+    with torch.no_grad():
+        for layer, W, b in zip(layers, network.weights, network.biases, strict=True):
+            layer.weight.copy_(torch.from_numpy(W.T))
+            layer.bias.copy_(torch.from_numpy(b))
+
+
+def _policy_layers(model: PPO | SAC) -> list[torch.nn.Linear]:
+    """From features to the mean of the action."""
+    if isinstance(model, SAC):
+        modules = [*model.actor.latent_pi, model.actor.mu]
+    else:
+        modules = [*model.policy.mlp_extractor.policy_net, model.policy.action_net]
+    return [module for module in modules if isinstance(module, torch.nn.Linear)]
+
+
+def _falling(first: float, last_share: float, spent: Callable[[], float]) -> Callable[[float], float]:
+    """Learning rate that falls in a straight line over the budget, whatever stable-baselines3 counts."""
+    return lambda _: first * (1.0 - (1.0 - last_share) * min(spent(), 1.0))
+
+
+def _updates(
+    model: PPO | SAC,
+    flights: TrainingVecEnv,
+    options: PpoOptions | SacOptions,
+    spent: Callable[[], float],
+    start: Network | None,
+    multiplier: Multiplier | None = None,
+) -> Iterator[tuple[Progress, Network]]:
+    """Learn in pieces of `horizon` steps of all rows, each checked before it is handed out."""
+    if start is not None:
+        take_over(model, start)
+    update = 0
+    while spent() < 1.0:
+        held = start is not None and isinstance(options, PpoOptions) and update < options.critic_updates
+        for layer in _policy_layers(model):
+            layer.requires_grad_(not held)
+        update += 1
+        try:
+            model.learn(flights.num_envs * options.horizon, reset_num_timesteps=False, log_interval=_NEVER)
+        except ValueError as error:
+            # Torch and the environment refuse what is not finite, each with words of its own.
+            if _unsound(model) is None:
+                raise
+            raise _lost(model, update) from error
+        if _unsound(model) is not None:
+            raise _lost(model, update)
+        tally = flights.tally()
+        if multiplier is not None:
+            multiplier.update(tally.violation_share)
+        yield Progress(update, model.num_timesteps, tally.reward), export(model, flights.features)
+
+
+def _unsound(model: PPO | SAC) -> str | None:
+    """What is not finite in a learner: a loss or the weights; None where all is well."""
+    for name, value in model.logger.name_to_value.items():
+        if "loss" in name and not np.isfinite(value):
+            return f"{name.removeprefix('train/').replace('_', ' ')} is {value}"
+    if not all(bool(torch.isfinite(parameter).all()) for parameter in model.policy.parameters()):
+        return "a weight is not finite"
+    return None
+
+
+def _lost(model: PPO | SAC, update: int) -> TrainingError:
+    return TrainingError(
+        f"{_unsound(model)} at update {update}: the last good policy is kept; a smaller learning_rate may "
+        "help"
+    )

@@ -1,0 +1,211 @@
+"""Many flights, or all vehicles of many teams, as one SB3 `VecEnv`: what a network in training sees.
+
+Observations are the network's scaled features, actions its outputs. Nothing is done in Python per row and
+step but where an episode ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+
+from quad_envs.envs.batch import TrackingBatch
+from quad_envs.envs.kernel import COST, CRASHED, REWARD, TRUNCATED, VIOLATED
+from quad_envs.envs.options import TrackingOptions
+from quad_envs.envs.team_batch import TeamBatch
+from quad_envs.envs.team_options import TeamOptions
+from quad_envs.tasks import Task, TeamTask
+
+from .networks import Features, Floats, default_features, hover_actions
+
+Bools = NDArray[np.bool_]
+TaskOptions = TrackingOptions | TeamOptions
+# Apart from the seeds of environments, so that no training start is one from which policies are judged.
+_STREAM = 0x51_AD
+_NOTHING: Any = MappingProxyType({})  # shared by all rows where nothing ended; nobody can write into it
+
+
+class Tally(NamedTuple):
+    """Means over rows and steps."""
+
+    reward: float
+    violation_share: float
+
+
+class TrainingVecEnv(VecEnv):
+    """n flights, or the vehicles of n teams, that begin anew in the step in which they end.
+
+    Row by row it is `TrackingVectorEnv` or `TeamVectorEnv`; vehicle i of team t is row t N + i. A team whose
+    vehicles crash ends as a whole, so that no row is ever of a vehicle that is no more.
+
+    Args:
+        options: Of the task.
+        n: Number of flights or teams.
+        seed: One number, from which starts are drawn that no seed of an environment gives; or such a seed
+            for each flight or team.
+        features: What the network sees; None for all that `default_features` keeps.
+        staggered: Whether the first episodes are cut at random, so that flights are at all times of the
+            episode from then on. A cut counts as a truncation.
+
+    Raises:
+        ValueError: If n < 1, or actions of the task are no rotor commands.
+    """
+
+    render_mode = None
+
+    def __init__(
+        self,
+        options: TaskOptions,
+        n: int,
+        seed: int | Sequence[int] = 0,
+        *,
+        features: Features | None = None,
+        staggered: bool = True,
+    ) -> None:
+        if n < 1:
+            raise ValueError(f"the number of flights or teams must be >= 1, got {n!r}")
+        self._batch: TrackingBatch | TeamBatch
+        if isinstance(options, TeamOptions):
+            self._batch = TeamBatch(replace(options, terminate="team"), n)
+            self._size = options.vehicles
+        else:
+            self._batch, self._size = TrackingBatch(options, n), 1
+        if isinstance(self.task, TeamTask) and self.task.mission == "estimation":
+            raise ValueError(
+                f"actions of {self.task.env_id} are estimates, and this trains networks that command rotors: "
+                "choose quad/TargetTracking-v0 or a tracking task"
+            )
+        self.features = features or default_features(self.task.layout)
+        self._columns = self.features.columns(self.task.layout)
+        self._mean = np.asarray(self.features.mean, dtype=np.float32)
+        self._rate = (1.0 / np.asarray(self.features.scale)).astype(np.float32)
+        rows = n * self._size
+        self._out = np.empty((rows, self.task.layout.size), dtype=np.float32)
+        self._actions = np.zeros((rows, self.action_size), dtype=np.float32)
+        self._n, self._staggered = n, staggered
+        self._cut = np.zeros(n, dtype=np.int64)
+        self._infos = [_NOTHING] * rows
+        self.costs, self.violated = np.zeros(rows), np.zeros(rows, dtype=np.bool_)  # of the last step
+        self._steps, self._reward, self._violations = 0, 0.0, 0
+        super().__init__(
+            rows,
+            spaces.Box(-np.inf, np.inf, (self._columns.size,), np.float32),
+            spaces.Box(-1.0, 1.0, (self.action_size,), np.float32),
+        )
+        self.seed(seed)
+
+    @property
+    def task(self) -> Task | TeamTask:
+        """What is known of the task before the flight."""
+        return self._batch.task
+
+    @property
+    def action_size(self) -> int:
+        """Numbers in an action of one row."""
+        return self.task.action_size if isinstance(self.task, TeamTask) else 4
+
+    def seed(self, seed: int | Sequence[int] | None = None) -> list[int | None]:
+        """Set what the next `reset` draws from; see the class."""
+        if isinstance(seed, Sequence):
+            if len(seed) != self._n:
+                raise ValueError(f"seed must be one number or {self._n} of them, got {len(seed)}")
+            self._generators = [seeding.np_random(value)[0] for value in seed]
+            self._stagger = np.random.default_rng([_STREAM, *seed])
+        else:
+            words = np.random.SeedSequence(None if seed is None else [_STREAM, int(seed)]).spawn(self._n + 1)
+            self._stagger, *self._generators = map(np.random.default_rng, words)
+        return [None] * self.num_envs
+
+    def reset(self) -> Floats:
+        """Begin all episodes."""
+        for group in range(self._n):
+            self._begin(group)
+        steps = self.task.episode_steps
+        self._cut[:] = self._stagger.integers(1, steps + 1, self._n) if self._staggered else steps + 1
+        self.costs, self.violated = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=np.bool_)
+        return self._scaled(self._out)
+
+    def step_async(self, actions: Floats) -> None:
+        """Take the network's outputs, (rows, action size), in [-1, 1]."""
+        self._actions = np.ascontiguousarray(hover_actions(actions, self.task), dtype=np.float32)
+
+    def step_wait(self) -> tuple[Floats, Floats, Bools, list[dict[str, Any]]]:
+        """One control period of all rows.
+
+        Returns:
+            Features, rewards, where an episode ended, and infos: empty but where an episode ended. There are
+            `terminal_observation` (features), `TimeLimit.truncated`.
+        """
+        self._batch.step(self._actions, self._out)
+        rows = self._batch.rows
+        rewards = rows[:, REWARD].astype(np.float32)
+        self.costs, self.violated = rows[:, COST].copy(), rows[:, VIOLATED] > 0.0
+        self._steps += 1
+        self._reward += float(rewards.sum())
+        self._violations += int(np.count_nonzero(self.violated))
+        crashed = rows[:, CRASHED] > 0.0
+        self._cut -= 1
+        ended = (crashed | (rows[:, TRUNCATED] > 0.0)).reshape(self._n, self._size).all(axis=1)
+        ended |= self._cut == 0
+        if not ended.any():
+            return self._scaled(self._out), rewards, np.zeros(self.num_envs, dtype=np.bool_), self._infos[:]
+        dones, infos = np.repeat(ended, self._size), self._infos[:]
+        last = self._scaled(self._out[dones])
+        for row, features in zip(np.flatnonzero(dones).tolist(), last, strict=True):
+            infos[row] = {"terminal_observation": features, "TimeLimit.truncated": not bool(crashed[row])}
+        for group in np.flatnonzero(ended).tolist():
+            self._begin(group)
+        return self._scaled(self._out), rewards, dones, infos
+
+    def tally(self) -> Tally:
+        """Means since the last call."""
+        n = max(self._steps, 1) * self.num_envs
+        means = Tally(self._reward / n, self._violations / n)
+        self._steps, self._reward, self._violations = 0, 0.0, 0
+        return means
+
+    def _begin(self, group: int) -> None:
+        """A new episode of one flight or team."""
+        if isinstance(self._batch, TeamBatch):
+            mine = self._out[group * self._size : (group + 1) * self._size]
+            self._batch.reset_team(group, self._generators[group], mine)
+        else:
+            self._batch.reset_row(group, self._generators[group], self._out[group])
+
+    def _scaled(self, observations: Floats) -> Floats:
+        out: Floats = np.take(observations, self._columns, axis=1)
+        out -= self._mean
+        out *= self._rate
+        return out
+
+    def close(self) -> None:
+        """There is nothing to close."""
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """An attribute, the same for all rows."""
+        return [getattr(self, attr_name)] * len(self._rows_of(indices))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Refused: rows have nothing of their own to set."""
+        raise AttributeError(f"rows of {type(self).__name__} share everything: cannot set {attr_name!r}")
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Refused: rows have no methods of their own."""
+        raise AttributeError(f"rows of {type(self).__name__} have no method {method_name!r} of their own")
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """No row is wrapped."""
+        return [False] * len(self._rows_of(indices))
+
+    def _rows_of(self, indices: Any) -> list[int]:
+        return list(self._get_indices(indices))
