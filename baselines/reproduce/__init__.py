@@ -10,14 +10,10 @@ from pathlib import Path
 from quad_envs.names import unknown_name
 
 from ..results import write_atomic
-from .estimation_claims import estimation_claims
-from .estimation_tables import estimation_tables
-from .formation_claims import formation_claims
-from .formation_tables import formation_tables
+from . import estimation_claims, estimation_tables, formation_claims, formation_tables, target_claims
 from .regulation_claims import REGULATION_CLAIMS
 from .results import Section
 from .tables import table_4_1, table_4_2
-from .target_claims import target_claims, target_tables
 from .tracking_claims import TRACKING_CLAIMS
 
 
@@ -37,17 +33,17 @@ def _unprinted(chapter: int) -> str:
 
 def claims_5(jobs: int = 1) -> Section:
     """The claims of chapter 5 on formation flight."""
-    return Section("claims-5", _unprinted(5), formation_tables(jobs), formation_claims(jobs))
+    return Section("claims-5", _unprinted(5), formation_tables.tables(jobs), formation_claims.claims(jobs))
 
 
 def claims_6(jobs: int = 1) -> Section:
     """The claims of chapter 6 on cooperative estimation; batched, so that `jobs` changes nothing."""
-    return Section("claims-6", _unprinted(6), estimation_tables(), estimation_claims())
+    return Section("claims-6", _unprinted(6), estimation_tables.tables(), estimation_claims.claims())
 
 
 def claims_7(jobs: int = 1) -> Section:
     """The claims of chapter 7 on both together."""
-    return Section("claims-7", _unprinted(7), target_tables(jobs), target_claims(jobs))
+    return Section("claims-7", _unprinted(7), target_claims.table(jobs), target_claims.claims(jobs))
 
 
 SECTIONS: dict[str, Callable[[int], Section]] = {

@@ -229,7 +229,7 @@ def _southern_pass(wrap: bool, runs: int) -> float:
     return float(np.sqrt(np.mean(squares)))
 
 
-def estimation_claims() -> list[Claim]:
+def claims() -> list[Claim]:
     """All of them."""
     return [
         trilateration_claim(),

@@ -39,7 +39,7 @@ def _of_range(name: str, vehicle: int) -> list[float]:
     return [track.rmse(vehicle, part) for part in INTERVALS]
 
 
-def estimation_tables() -> list[Measured]:
+def tables() -> list[Measured]:
     """Filters with ranges, on the aircraft, and fused in a ring."""
     cells = []
     for name, rows in _RANGE.items():

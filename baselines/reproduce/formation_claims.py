@@ -282,7 +282,7 @@ def centre_claim(jobs: int = 1) -> Claim:
     return Claim("5-centre", text, verdict(float(np.mean(right))), numbers, "HOLDS")
 
 
-def formation_claims(jobs: int = 1) -> list[Claim]:
+def claims(jobs: int = 1) -> list[Claim]:
     """All of them."""
     return [
         printed_consensus_claim(jobs),

@@ -130,6 +130,6 @@ def default_table(jobs: int = 1) -> list[Measured]:
     return cells
 
 
-def formation_tables(jobs: int = 1) -> list[Measured]:
+def tables(jobs: int = 1) -> list[Measured]:
     """All of them."""
     return [*lag_table(jobs), *lifetime_table(jobs), *head_on_table(jobs), *default_table(jobs)]

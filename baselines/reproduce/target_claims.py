@@ -105,7 +105,7 @@ def fly_case(case: int, target: str, variant: str, jobs: int = 1) -> list[TeamOu
     return fly_teams(flights(case, target, variant), jobs)
 
 
-def target_tables(jobs: int = 1) -> list[Measured]:
+def table(jobs: int = 1) -> list[Measured]:
     """The table of chapter 7."""
     fly_teams([flight for row in CASES for flight in flights(*row[:3])], jobs)
     cells = []
@@ -207,6 +207,6 @@ def height_estimate_claim(jobs: int = 1, runs: int = 4000) -> Claim:
     return Claim("7-height", text, verdict(float(np.mean(right))), numbers, "HOLDS")
 
 
-def target_claims(jobs: int = 1) -> list[Claim]:
+def claims(jobs: int = 1) -> list[Claim]:
     """All of them."""
     return [trust_claim(jobs), contact_claim(jobs), height_estimate_claim(jobs), sharing_claim(jobs)]
