@@ -75,11 +75,11 @@ def test_the_gradient_of_the_reward_is_its_derivative(limits):
     def rewards(x, u, p):
         out, scrap = np.empty(len(x)), (np.zeros(12), np.zeros(4), np.zeros(4), work)
         for j in range(len(x)):
-            out[j] = reward_vjp(x[j], references[j], u[j], p[j], task, 0.0, *scrap)
+            out[j] = reward_vjp(x[j], references[j], u[j], p[j], task, 0.0, 0.0, *scrap)
         return out
 
     for j in range(60):
-        arguments = plants[j], references[j], commands[j], previous[j], task, 1.0
+        arguments = plants[j], references[j], commands[j], previous[j], task, 1.0, 0.0
         reward_vjp(*arguments, bar_x[j], bar_u[j], bar_p[j], work)
     x = plants[:, :12]
     assert np.allclose(bar_x, differences(lambda y: rewards(y, commands, previous), x), atol=1e-7)
@@ -99,7 +99,7 @@ def test_the_reward_of_the_adjoint_is_that_of_the_environment():
         commands, plants = env.unwrapped._batch.rows[:, 16:20].copy(), env.unwrapped.state
         for j in np.flatnonzero(~terminated):
             row = env.unwrapped.reference[j, k]
-            assert reward_vjp(plants[j], row, commands[j], previous[j], task, 0.0, *scrap) == rewards[j]
+            assert reward_vjp(plants[j], row, commands[j], previous[j], task, 0.0, 0.0, *scrap) == rewards[j]
         previous = commands
 
 
@@ -115,18 +115,31 @@ def test_the_adjoint_of_a_step_with_its_reward_is_the_derivative_of_both():
 
     def value(x, u, p):
         after = simulate(x, u, params, force_max=force_max)
-        rewards = [reward_vjp(after[j], references[j], u[j], p[j], task, 0.0, *scrap) for j in range(20)]
+        rewards = [reward_vjp(after[j], references[j], u[j], p[j], task, 0.0, 0.0, *scrap) for j in range(20)]
         return (after * bars).sum(axis=1) + bar_rewards * np.array(rewards)
 
     found = np.zeros((20, 16)), np.zeros((20, 4)), np.zeros((20, 4))
     tracking_vjp_rows(
         plants, commands, previous, simulate(plants, commands, params, force_max=force_max), references,
         np.zeros(20, dtype=np.bool_), np.full(20, force_max), np.tile(params.coefficients(), (20, 1)),
-        task, bars, bar_rewards, *found, np.zeros((SCRATCH_ROWS + 4, 16)),
+        task, bars, bar_rewards, 0.0, *found, np.zeros((SCRATCH_ROWS + 4, 16)),
     )  # fmt: skip
     assert np.allclose(found[0], differences(lambda x: value(x, commands, previous), plants), atol=1e-6)
     assert np.allclose(found[1], differences(lambda u: value(plants, u, previous), commands), atol=1e-6)
     assert np.allclose(found[2], differences(lambda p: value(plants, commands, p), previous), atol=1e-6)
+
+
+def test_the_gradient_of_the_cost_does_not_stop_where_the_reward_does():
+    env = gym.make("quad/CorridorTracking-v0")
+    task, row = task_vector(env.unwrapped.task, 5, 50.0), np.zeros(8)
+    x, command, work = np.zeros(16), np.full(4, 1.96), np.zeros(20)
+    x[0] = 2.5  # half a metre outside, five times the scale
+    for bar, bar_cost, expected in ((1.0, 0.0, 0.0), (0.0, 1.0, 10.0)):
+        bar_x = np.zeros(12)
+        assert (
+            reward_vjp(x, row, command, command, task, bar, bar_cost, bar_x, *np.zeros((2, 4)), work) == 0.0
+        )
+        assert np.allclose(bar_x, [expected, *[0.0] * 11])
 
 
 def test_slopes_of_the_action_map_are_its_derivative():

@@ -137,7 +137,7 @@ class DifferentiableFlights:
         return record
 
     def advance_vjp(
-        self, record: Record, bar_after: Array, bar_commands: Array, bar_rewards: Array
+        self, record: Record, bar_after: Array, bar_commands: Array, bar_rewards: Array, bar_cost: float = 0.0
     ) -> tuple[Array, Array, Array]:
         """Adjoint of `advance`.
 
@@ -146,6 +146,7 @@ class DifferentiableFlights:
             bar_after: Sensitivity to the plants afterwards, (n, 16).
             bar_commands: To the commands, as the next observation shows them, (n, 4).
             bar_rewards: To the rewards, (n,).
+            bar_cost: To the violation cost of each flight.
 
         Returns:
             Sensitivities to the actions (n, 4), the plants (n, 16) and the commands before (n, 4).
@@ -153,7 +154,7 @@ class DifferentiableFlights:
         flew_on = ~record.done[:, None]
         plants, commands, previous = np.empty((self.n, 16)), np.empty((self.n, 4)), np.empty((self.n, 4))
         tracking_vjp_rows(
-            *record[:8], self._vector, bar_after * flew_on, bar_rewards, plants, commands, previous,
+            *record[:8], self._vector, bar_after * flew_on, bar_rewards, np.float64(bar_cost), plants, commands, previous,
             self._scratch,
         )  # fmt: skip
         return (commands + bar_commands * flew_on) * record.slopes, plants, previous

@@ -1,9 +1,9 @@
 """Analytic policy gradient: the reward's gradient by backpropagation through the compiled dynamics.
 
 Model-based: it knows the equations of motion and the reward. Windows of `horizon` steps of many flights are
-rolled out and taken back; flights go on from window to window. The objective is sum_t gamma^t log(r_t + eps),
-because the gradient of the bounded reward itself vanishes where a flight is far off; evaluation is always on
-the reward.
+rolled out and taken back; flights go on from window to window. The objective is
+sum_t gamma^t (log(r_t + eps) - w c_t) with the violation cost c: the gradient of the bounded reward itself
+vanishes where a flight is far off, and where a violation exceeds its scale. Evaluation is always on the reward.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ class PolicyGradientOptions:
     final_rate: float = 0.03  # share of the learning rate at the end of the budget
     discount: float = 0.99
     epsilon: float = 1e-3  # of log(r + epsilon)
+    penalty: float = 0.0  # weight of the violation cost in the objective
     hidden: tuple[int, ...] = (64, 64)
     gradient_norm: float = 1.0  # to which gradients are clipped
 
@@ -63,6 +64,23 @@ class Actor:
             x = torch.tanh(layer(x))
         return x
 
+    def load(self, network: Network) -> None:
+        """Take over the weights of a network.
+
+        Raises:
+            ValueError: If it has other layers.
+        """
+        shapes = [tuple(layer.weight.shape[::-1]) for layer in self.layers]
+        if [W.shape for W in network.weights] != shapes:
+            raise ValueError(
+                f"cannot go on from layers {[W.shape for W in network.weights]} with layers {shapes}: give "
+                "the same hidden sizes"
+            )
+        with torch.no_grad():
+            for layer, W, b in zip(self.layers, network.weights, network.biases, strict=True):
+                layer.weight.copy_(torch.from_numpy(W.T.copy()))
+                layer.bias.copy_(torch.from_numpy(b))
+
     def arrays(self) -> tuple[tuple[Floats, ...], tuple[Floats, ...]]:
         """Weights (inputs, outputs) and biases as numpy arrays."""
         return (
@@ -87,7 +105,9 @@ def _window_gradient(actor: Actor, flights: DifferentiableFlights, options: Poli
         record, x, out = records[t], seen[t], outputs[t]
         weight = -(options.discount**t) / (n * options.horizon)
         rewards = np.where(record.crashed, 0.0, weight / (record.rewards + options.epsilon))
-        actions, plants, commands = flights.advance_vjp(record, plants, commands, rewards)
+        actions, plants, commands = flights.advance_vjp(
+            record, plants, commands, rewards, -weight * options.penalty
+        )
         value = out.detach().numpy()
         slope = np.where(value < 0.0, 1.0, np.where(gain * value < 1.0, gain, 0.0))
         out.backward(torch.from_numpy((actions * slope).astype(np.float32)))
@@ -102,6 +122,7 @@ def train(
     options: PolicyGradientOptions,
     seed: int,
     spent: Callable[[], float],
+    start: Network | None = None,
 ) -> Iterator[tuple[Progress, Network]]:
     """Train, and yield after each update.
 
@@ -110,6 +131,7 @@ def train(
         options: Hyperparameters.
         seed: Of everything random.
         spent: Share of the budget that is used up, 0 to 1; training ends at 1.
+        start: To go on from; a new network if not given.
 
     Raises:
         ValueError: If the task cannot be differentiated.
@@ -118,6 +140,8 @@ def train(
     torch.manual_seed(seed)
     flights = DifferentiableFlights(task_options, options.flights, seed)
     actor = Actor(len(flights.features.names), options.hidden, 4)
+    if start is not None:
+        actor.load(start)
     optimizer = torch.optim.Adam(actor.parameters, lr=options.learning_rate)
     update = 0
     while (share := spent()) < 1.0:

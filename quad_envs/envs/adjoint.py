@@ -120,12 +120,16 @@ def reward_vjp(
     previous: Array,
     task: Array,
     bar: float,
+    bar_cost: float,
     bar_x: Array,
     bar_command: Array,
     bar_previous: Array,
     work: Array,
 ) -> float:
     """The bounded reward (1 - v) / (1 + l) of a vehicle that flies, and bar times its gradient.
+
+    The reward does not change with a violation above its scale, where v = 1; the cost in `info`, the same
+    sum before it is cut off, does.
 
     Args:
         x: State after the step, (>= 12,).
@@ -134,6 +138,7 @@ def reward_vjp(
         previous: Of the step before, (4,), N.
         task: Task vector of `kernel`.
         bar: Sensitivity to the reward.
+        bar_cost: Sensitivity to the violation cost.
         bar_x: Result, (12,).
         bar_command: Result, (4,).
         bar_previous: Result, (4,).
@@ -147,7 +152,7 @@ def reward_vjp(
     cost = _violation_vjp(x, command, previous, task, bar_x, bar_command, bar_previous)
     _stage_cost_vjp(x, reference, command, task[HOVER], task[WEIGHT_Q], task[WEIGHT_R], cost_x, cost_command)
     reward = (1.0 - min(1.0, cost)) / (1.0 + loss)
-    along_v = -bar / (1.0 + loss) if cost < 1.0 else 0.0
+    along_v = bar_cost - (bar / (1.0 + loss) if cost < 1.0 else 0.0)
     along_l = -bar * reward / (1.0 + loss)
     for i in range(12):
         bar_x[i] = along_v * bar_x[i] + along_l * cost_x[i]
@@ -170,6 +175,7 @@ def tracking_vjp_rows(
     task: Array,
     bars: Array,
     bar_rewards: Array,
+    bar_cost: float,
     bar_plants: Array,
     bar_commands: Array,
     bar_previous: Array,
@@ -189,6 +195,7 @@ def tracking_vjp_rows(
         task: Task vector.
         bars: Sensitivity to the plants afterwards, (n, 16).
         bar_rewards: Sensitivity to the rewards, (n,).
+        bar_cost: Sensitivity to the violation cost of each flight.
         bar_plants: Result, (n, 16).
         bar_commands: Result, (n, 4).
         bar_previous: Result, (n, 4).
@@ -205,7 +212,7 @@ def tracking_vjp_rows(
                 bar_commands[j, i], bar_previous[j, i] = 0.0, 0.0
             continue
         reward_vjp(
-            after[j], references[j], commands[j], previous[j], task, bar_rewards[j],
+            after[j], references[j], commands[j], previous[j], task, bar_rewards[j], bar_cost,
             total, direct, bar_previous[j], work,
         )  # fmt: skip
         for i in range(12):
