@@ -28,8 +28,8 @@ from .kernel import (
 )
 from .pictures import NO_RENDERING, TeamPictures, checked_rendering
 from .team_batch import TeamBatch
-from .team_kernel import N_LOSS
 from .team_options import TeamOptions
+from .team_scores import N_LOSS
 
 Observation = NDArray[np.float32]
 Named = dict[str, Any]

@@ -13,37 +13,25 @@ from numpy.typing import NDArray
 
 from .._numba import Int, inline_kernel, kernel
 from ..agent_observations import N_PLAN_STAGE
-from ..constraints import TOLERANCE
 from ..dynamics import LANES, SCRATCH_ROWS, advance, load_vehicle, store_vehicle
 from ..parameters import Array
-from ..reward import stage_cost_parts
 from .exchange import (
     ALIVE,
-    ARENA,
-    CRASH_DISTANCE,
     DISTURBANCE,
     DRAW,
-    FORMATION_WEIGHT,
-    HAS_LEADER,
     HEARD,
     MEASUREMENT,
     MEASURES,
     N_MOTION,
-    N_VALUES,
     NEAREST,
     NOISE,
     ON_RAILS,
     PLAN,
     REFERENCE,
-    SCALES,
     SENSED_SLOTS,
     SENSOR_ROWS,
-    SEPARATION,
-    SLOT_ERROR,
     TARGET,
-    TERMS,
     WEIGHT,
-    WHOLE_TEAM,
     IntArray,
     Tables,
     hear,
@@ -58,32 +46,19 @@ from .kernel import (
     COEFFICIENTS,
     COMMAND,
     COST,
-    CRASHED,
     DT,
     EPISODE_COST,
-    EPISODE_STEPS,
     FORCE_MAX,
-    HOVER,
-    QUADRATIC,
-    REWARD,
-    STAGE_COST,
     STEP,
     SUBSTEPS,
-    TILT_OF_CRASH,
-    TRUNCATED,
-    VALUES,
-    VIOLATED,
-    WEIGHT_Q,
-    WEIGHT_R,
     apply_action,
     measure_plant,
-    violation_cost,
 )
+from .team_scores import judge_estimate, judge_team
 
 PLAN_SCALE = 5.0  # m, and m/s: of the plan in an action, relative to the sender
 ESTIMATE_REACH = 20.0  # m: of an estimated position in an action, relative to the vehicle
 ESTIMATE_SPEED = 5.0  # m/s: of an estimated velocity in an action
-N_LOSS = 6  # parts of the stage cost: position, velocity, attitude, rates, effort, formation
 
 
 def scratch_size(vehicles: int, sensed: int) -> int:
@@ -154,130 +129,6 @@ def _fly(
             block = w[(i // stride) * size : (i // stride + 1) * size]
             finite = store_vehicle(block, i % stride, stride, row)
             row[NEAREST] = math.sqrt(places[3, i]) if finite else math.nan
-
-
-@inline_kernel
-def _score(row: Array, loss: float, cost: float, crashed: bool, task: Array) -> None:
-    """Reward and what belongs to it."""
-    v = min(1.0, cost)
-    if task[QUADRATIC] > 0.0:
-        row[REWARD] = -loss - v
-    else:
-        row[REWARD] = 0.0 if crashed else (1.0 - v) / (1.0 + loss)
-    row[STAGE_COST] = loss
-    row[COST] = cost
-    row[VIOLATED] = 1.0 if cost > 0.0 else 0.0
-    row[CRASHED] = 1.0 if crashed else 0.0
-    row[TRUNCATED] = 1.0 if row[STEP] >= task[EPISODE_STEPS] and not crashed else 0.0
-
-
-@kernel
-def _judge_flight(
-    row: Array, wanted: Array, previous: Array, formation: float, task: Array, team: Array
-) -> None:
-    """Stage cost, violations, crash and reward of a vehicle after its step.
-
-    Args:
-        row: The vehicle.
-        wanted: Its slot at the new time: p*, v*, sin and cos of psi_ref, (8,).
-        previous: Its rotor commands of the step before, (4,).
-        formation: Mean squared error to its neighbours, m^2.
-        task: Task vector.
-        team: Team vector.
-    """
-    parts = stage_cost_parts(row, wanted, row[COMMAND], task[HOVER], task[WEIGHT_Q], task[WEIGHT_R])
-    row[TERMS], row[TERMS + 1], row[TERMS + 2], row[TERMS + 3], row[TERMS + 4] = parts
-    row[TERMS + 5] = team[FORMATION_WEIGHT] * formation
-    loss = row[TERMS + 5]
-    for i in range(5):
-        loss += row[TERMS + i]
-    off = (row[0] - wanted[0]) ** 2 + (row[1] - wanted[1]) ** 2 + (row[2] - wanted[2]) ** 2
-    row[SLOT_ERROR] = math.sqrt(off)
-    from_origin = row[0] * row[0] + row[1] * row[1] + row[2] * row[2]
-    crashed = (
-        not row[NEAREST] >= team[CRASH_DISTANCE]  # also where it is nan: the state was not finite
-        or abs(row[6]) >= task[TILT_OF_CRASH]
-        or abs(row[7]) >= task[TILT_OF_CRASH]
-        or from_origin > team[ARENA] * team[ARENA]
-    )
-    cost = violation_cost(row, previous, task)
-    last = int(team[N_VALUES]) - 1
-    row[VALUES + last] = team[SEPARATION] - row[NEAREST]
-    if row[VALUES + last] > TOLERANCE:
-        cost += row[VALUES + last] / team[SCALES + last]
-    for k in range(last + 1):
-        value = row[VALUES + k]
-        row[TERMS + N_LOSS + k] = value / team[SCALES + k] if value > TOLERANCE else 0.0
-    _score(row, loss, cost, crashed, task)
-
-
-@inline_kernel
-def _judge_estimate(row: Array, target: Array, estimate: Array, task: Array) -> None:
-    """Score of an estimate r, v (6,) of the target (6,) made by a vehicle on rails."""
-    position, velocity = 0.0, 0.0
-    for i in range(3):
-        position += (estimate[i] - target[i]) ** 2
-        velocity += (estimate[3 + i] - target[3 + i]) ** 2
-    row[TERMS], row[TERMS + 1] = position, velocity
-    row[SLOT_ERROR] = math.sqrt(position)
-    _score(row, position + velocity, 0.0, False, task)
-
-
-@kernel
-def _formation_error(k: int, i: int, rows: Array, first: int, tables: Tables) -> float:
-    """Mean of |p_i - p_j - delta_ij|^2 over the neighbours j in the present graph; 0 without any."""
-    total, count = 0.0, 0
-    own = rows[first + i]
-    graph = tables.weights[tables.schedule[min(k, tables.schedule.shape[0] - 1)], i]
-    for s in range(graph.shape[0]):
-        if graph[s] > 0.0:
-            other = rows[first + tables.neighbours[i, s]]
-            if other[ALIVE] > 0.0:
-                count += 1
-                for c in range(3):
-                    total += (own[c] - other[c] - tables.offsets[i, s, c]) ** 2
-    return total / count if count > 0 else 0.0
-
-
-@inline_kernel
-def _want(k: int, i: int, first: int, tables: Tables, team: Array, out: Array) -> None:
-    """Where vehicle i should be: its slot beside the leader's reference, or beside the target; (8,)."""
-    if team[HAS_LEADER] > 0.0:
-        reference = tables.references[tables.which[REFERENCE, first]]
-        for c in range(8):
-            out[c] = reference[min(k, reference.shape[0] - 1), c]
-    else:
-        target = tables.targets[tables.which[TARGET, first]]
-        for c in range(6):
-            out[c] = target[min(k, target.shape[0] - 1), c]
-        out[6], out[7] = 0.0, 1.0
-    for c in range(3):
-        out[c] += tables.offsets[i, tables.offsets.shape[1] - 1, c]
-
-
-@kernel
-def _judge_team(
-    rows: Array, first: int, tables: Tables, previous: Array, wanted: Array, task: Array, team: Array
-) -> None:
-    """Judge the vehicles of a team in flight after their step; then who crashed, and with whom."""
-    n = tables.neighbours.shape[0]
-    k = int(rows[first, STEP])
-    anybody = False
-    for i in range(n):
-        row = rows[first + i]
-        if row[ALIVE] > 0.0:
-            _want(k, i, first, tables, team, wanted)
-            _judge_flight(row, wanted, previous[i], _formation_error(k, i, rows, first, tables), task, team)
-            anybody = anybody or row[CRASHED] > 0.0
-        else:
-            row[REWARD] = 0.0
-    for i in range(n):
-        row = rows[first + i]
-        if anybody and team[WHOLE_TEAM] > 0.0:
-            row[CRASHED], row[TRUNCATED] = 1.0, 0.0
-            row[REWARD] = row[REWARD] if task[QUADRATIC] > 0.0 else 0.0
-        elif row[CRASHED] > 0.0:
-            row[ALIVE] = 0.0
 
 
 @kernel
@@ -363,7 +214,7 @@ def _ride(
             estimate[3 + c] = ESTIMATE_SPEED * min(max(float(actions[first + i, 3 + c]), -1.0), 1.0)
         k = min(int(row[STEP]), target.shape[0] - 1)
         row[STEP] += 1.0
-        _judge_estimate(row, target[k], estimate, task)
+        judge_estimate(row, target[k], estimate, task)
         for c in range(3):
             row[c] += task[DT] * row[3 + c]  # level and at heading 0, so that V_B is the inertial velocity
 
@@ -458,7 +309,7 @@ def step_teams(
                     _count_clipped(rows[i], actions[i], 0)
                 _ride(rows, begin, tables, actions, task, wanted)
             else:
-                _judge_team(rows, begin, tables, previous[begin - first :], wanted, task, team)
+                judge_team(rows, begin, tables, previous[begin - first :], wanted, task, team)
                 for i in range(begin, begin + n):
                     rows[i, EPISODE_COST] += rows[i, COST] if rows[i, ALIVE] > 0.0 else 0.0
             _inform_team(
@@ -519,5 +370,5 @@ def begin_team(
         for i in range(n):
             for a in range(4):
                 scratch[4 * i + a] = rows[begin + i, COMMAND][a]
-        _judge_team(rows, begin, tables, scratch[: 4 * n].reshape(n, 4), wanted, task, team)
+        judge_team(rows, begin, tables, scratch[: 4 * n].reshape(n, 4), wanted, task, team)
     _inform_team(rows, begin, messages[begin : begin + n], past, tables, task, team, rest, out)

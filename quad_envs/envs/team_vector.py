@@ -29,8 +29,8 @@ from .kernel import (
     VIOLATED,
 )
 from .team_batch import TeamBatch
-from .team_kernel import N_LOSS
 from .team_options import TeamOptions
+from .team_scores import N_LOSS
 
 Observations = NDArray[np.float32]
 Bools = NDArray[np.bool_]
