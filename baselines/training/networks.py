@@ -6,16 +6,19 @@ Inference is numpy alone, so that a shipped policy needs no torch. Training fram
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from functools import lru_cache
+from typing import Any, Literal, NoReturn, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_envs._numba import entry_of
 from quad_envs.agent_observations import AgentLayout
 from quad_envs.observations import N_REFERENCE, TrackingLayout
 from quad_envs.tasks import BaseTask, Task, TeamTask
 
 from ..policy import N_FALLBACKS, Actions, PolicyState
+from .inference import forward_rows
 
 Floats = NDArray[np.float32]
 Squash = Literal["tanh", "clip"]
@@ -23,6 +26,8 @@ Commands = Literal["hover", "action"]
 
 # Preview stages that a network sees: near ones densely, the horizon of the MPCs at the end.
 TRACKING_STAGES = (0, 1, 2, 3, 5, 7, 10, 14, 19, 25)
+_FEW = 4  # rows up to which the compiled form is faster
+_forward = entry_of(forward_rows)
 # Typical size of each part, so that a network sees numbers of order one.
 _SCALES = {
     "V_B": 3.0,
@@ -175,6 +180,15 @@ def hover_actions(outputs: Floats, task: BaseTask) -> Floats:
     return out
 
 
+def hover_outputs(actions: Floats, task: BaseTask) -> Floats:
+    """The outputs of which `hover_actions` makes these actions, within [-1, 1]."""
+    out = actions.copy()
+    gain = task.hover_force / (task.force_max - task.hover_force)
+    rotors = out[..., :4]
+    np.copyto(rotors, np.minimum(np.where(rotors < 0.0, rotors, rotors / gain), 1.0))
+    return out
+
+
 class NetworkPolicy:
     """A network as a policy; it remembers nothing.
 
@@ -207,6 +221,10 @@ class NetworkPolicy:
         W = network.weights[0] / scale[:, None]
         first = W.astype(np.float32), (network.biases[0] - mean @ W).astype(np.float32)
         self._layers = [first, *zip(network.weights[1:], network.biases[1:], strict=True)]
+        self._sizes = np.array([len(self._columns), *(len(b) for _, b in self._layers)], dtype=np.int64)
+        self._flat = np.concatenate([part.reshape(-1) for layer in self._layers for part in layer])
+        gain = task.hover_force / (task.force_max - task.hover_force)
+        self._gain = np.float32(gain if network.commands == "hover" else 1.0)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.name!r}, {self.task.env_id!r})"
@@ -230,23 +248,42 @@ class NetworkPolicy:
         if obs.ndim != 2 or obs.shape[1] != self._size:
             shape = np.shape(observation)
             raise ValueError(f"observation must have shape (n, {self._size}) or ({self._size},), got {shape}")
-        x = obs[:, self._columns]
-        if not np.isfinite(x).all():
-            row, column = np.argwhere(~np.isfinite(x))[0]
-            name = self.network.features.names[column]
-            raise ValueError(
-                f"observation {row} is not finite: {name} is {x[row, column]}; check the sensors"
-            )
-        for k, (W, b) in enumerate(self._layers):
-            x = x @ W + b
-            if k + 1 < len(self._layers) or self.network.squash == "tanh":
-                np.tanh(x, out=x)
-        x = np.clip(x, -1.0, 1.0)
-        actions = hover_actions(x, self.task) if self.network.commands == "hover" else x
+        actions = self._few(obs) if len(obs) <= _FEW else self._many(obs)
         return actions[0] if one else actions, _no_state(len(obs))
 
+    def _few(self, obs: Floats) -> Actions:
+        """Without the cost of calling numpy."""
+        out = np.empty((len(obs), self._sizes[-1]), dtype=np.float32)
+        work = np.empty((2, self._sizes.max()), dtype=np.float32)
+        squash = self.network.squash == "tanh"
+        bad = _forward(obs, self._columns, self._sizes, self._flat, squash, self._gain, work, out)
+        if bad >= 0:
+            self._refuse(obs, *divmod(bad, len(self._columns)))
+        return out
 
+    def _many(self, obs: Floats) -> Actions:
+        """The same in numpy."""
+        x = obs[:, self._columns]
+        if not np.isfinite(x).all():
+            self._refuse(obs, *np.argwhere(~np.isfinite(x))[0].tolist())
+        for k, (W, b) in enumerate(self._layers):
+            x = x @ W
+            x += b
+            if k + 1 < len(self._layers) or self.network.squash == "tanh":
+                np.tanh(x, out=x)
+        np.clip(x, -1.0, 1.0, out=x)
+        return hover_actions(x, self.task) if self.network.commands == "hover" else x
+
+    def _refuse(self, obs: Floats, row: int, column: int) -> NoReturn:
+        value, name = obs[row, self._columns[column]], self.network.features.names[column]
+        raise ValueError(f"observation {row} is not finite: {name} is {value}; check the sensors")
+
+
+@lru_cache(maxsize=64)
 def _no_state(n: int) -> PolicyState:
-    """The state of a policy that remembers nothing: no fallbacks, no iterations."""
+    """The state of a policy that remembers nothing, shared by its calls and so read-only."""
+    memory, fallbacks = np.zeros((n, 0)), np.zeros((n, N_FALLBACKS), dtype=np.int64)
     count = np.zeros(n, dtype=np.int64)
-    return PolicyState(np.zeros((n, 0)), np.zeros((n, N_FALLBACKS), dtype=np.int64), count, count)
+    for part in (memory, fallbacks, count):
+        part.setflags(write=False)
+    return PolicyState(memory, fallbacks, count, count)

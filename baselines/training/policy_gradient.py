@@ -33,7 +33,8 @@ class PolicyGradientOptions:
     learning_rate: float = 1e-2
     final_rate: float = 0.03  # share of the learning rate at the end of the budget
     discount: float = 0.99
-    epsilon: float = 1e-3  # of log(r + epsilon)
+    epsilon: float = 1e-3  # of log(r + epsilon), at the beginning
+    final_epsilon: float = 1e-3  # and at the end; the larger, the more it is the sum of rewards itself
     penalty: float = 0.0  # weight of the violation cost in the objective
     hidden: tuple[int, ...] = (64, 64)
     gradient_norm: float = 1.0  # to which gradients are clipped
@@ -89,7 +90,9 @@ class Actor:
         )
 
 
-def _window_gradient(actor: Actor, flights: DifferentiableFlights, options: PolicyGradientOptions) -> float:
+def _window_gradient(
+    actor: Actor, flights: DifferentiableFlights, options: PolicyGradientOptions, epsilon: float
+) -> float:
     """Roll a window out, take it back, leave the gradient in the actor's parameters; the mean reward."""
     task, gain = flights.task, flights.task.hover_force / (flights.task.force_max - flights.task.hover_force)
     seen, outputs, records = [], [], []
@@ -104,7 +107,7 @@ def _window_gradient(actor: Actor, flights: DifferentiableFlights, options: Poli
     for t in range(options.horizon - 1, -1, -1):
         record, x, out = records[t], seen[t], outputs[t]
         weight = -(options.discount**t) / (n * options.horizon)
-        rewards = np.where(record.crashed, 0.0, weight / (record.rewards + options.epsilon))
+        rewards = np.where(record.crashed, 0.0, weight / (record.rewards + epsilon))
         actions, plants, commands = flights.advance_vjp(
             record, plants, commands, rewards, -weight * options.penalty
         )
@@ -148,7 +151,8 @@ def train(
         for group in optimizer.param_groups:
             group["lr"] = options.learning_rate * (1.0 - (1.0 - options.final_rate) * share)
         optimizer.zero_grad()
-        reward = _window_gradient(actor, flights, options)
+        epsilon = options.epsilon * (options.final_epsilon / options.epsilon) ** share
+        reward = _window_gradient(actor, flights, options, epsilon)
         norm = float(torch.nn.utils.clip_grad_norm_(actor.parameters, options.gradient_norm))
         if not np.isfinite(norm):
             raise TrainingError(f"the gradient is {norm} at update {update}: the last good policy is kept")

@@ -1,0 +1,214 @@
+"""DAgger: imitation of a policy, labelled in the states that the network itself brings about.
+
+The expert, an MPC by default, decides in every state; at first it also flies, later the network does. The
+network is fitted to all labels so far, the longer the more there are. An expert that remembers more than its
+observation shows cannot be imitated by a network that remembers nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+
+from quad_envs.envs.options import TrackingOptions
+from quad_envs.envs.team_options import TeamOptions
+from quad_envs.envs.team_vector import TeamVectorEnv
+from quad_envs.envs.tracking_vector import TrackingVectorEnv
+from quad_envs.tasks import BaseTask, TeamTask
+
+from ..errors import TrainingError
+from ..policy import Policy, make_policy, mission_of
+from ..rollout import is_privileged
+from .networks import Floats, Network, NetworkPolicy, default_features, hover_outputs
+from .policy_gradient import Actor, Progress
+
+_EXPERTS = {"tracking": "sdc-nmpc", "formation": "consensus-mpc"}
+_STREAM = 0xDA_66E2  # apart from the seeds of environments, so that no start is one of those held out
+
+
+@dataclass(frozen=True, slots=True)
+class DaggerOptions:
+    """Hyperparameters of DAgger."""
+
+    expert: str = ""  # a policy, or a trained one; sdc-nmpc for one vehicle, consensus-mpc for formations
+    rows: int = 64  # flights, or vehicles of all teams
+    window: int = 20  # steps of each row between fits
+    expert_flies: float = 0.2  # share of the budget in which the rows that the expert flies fall to none
+    fits: int = 40  # minibatches after each window at the beginning
+    final_fits: int = 200  # and at the end of the budget, when there are many labels
+    batch: int = 512
+    learning_rate: float = 3e-3
+    final_rate: float = 0.02  # share of the learning rate at the end of the budget
+    threshold: float = 0.05  # of an output's error, up to which the loss is quadratic
+    hidden: tuple[int, ...] = (64, 64)
+
+
+class LabelledFlights:
+    """Flights of which every state is labelled with what an expert would do.
+
+    Args:
+        options: Of the task.
+        expert: Decides from observations.
+        rows: Number of flights, or of vehicles in as many teams as that makes.
+        seed: Of the starts, and of who flies.
+    """
+
+    def __init__(self, options: TrackingOptions | TeamOptions, expert: Policy, rows: int, seed: int) -> None:
+        self._size = options.vehicles if isinstance(options, TeamOptions) else 1
+        count = max(1, rows // self._size)
+        if isinstance(options, TeamOptions):
+            self.env: TeamVectorEnv | TrackingVectorEnv = TeamVectorEnv(options, count)
+        else:
+            given = {field.name: getattr(options, field.name) for field in fields(options)}
+            self.env = TrackingVectorEnv(count, **given)
+        self.task: BaseTask = self.env.task
+        self.features = default_features(self.env.task.layout)
+        self.outputs = self.task.action_size if isinstance(self.task, TeamTask) else 4
+        self._columns = self.features.columns(self.env.task.layout)
+        self._mean, self._scale = (
+            np.array(part, dtype=np.float32) for part in (self.features.mean, self.features.scale)
+        )
+        sequence = np.random.SeedSequence([_STREAM, seed])
+        self._rng = np.random.default_rng(sequence)
+        self._expert = expert
+        self._observations, _ = self.env.reset(seed=sequence.generate_state(count, np.uint64).tolist())
+        self._state, n = None, self.env.num_envs
+        self._begins, self._done = np.ones(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
+
+    def collect(self, network: Network, beta: float, steps: int) -> tuple[Floats, Floats, float]:
+        """Fly on.
+
+        Args:
+            network: Flies the rows that the expert does not.
+            beta: Share of the rows that the expert flies.
+            steps: Of every row.
+
+        Returns:
+            Scaled features (m, inputs), the expert's outputs (m, outputs) and the mean reward.
+        """
+        flier = NetworkPolicy(network, self.task, "learner")
+        by_expert = (self._rng.random(self.env.num_envs) < beta)[:, None]
+        seen, wanted, rewards = [], [], []
+        for _ in range(steps):
+            labels, self._state = self._expert.predict(self._observations, self._state, self._begins)
+            actions = labels if by_expert.all() else np.where(
+                by_expert, labels, flier.predict(self._observations)[0]
+            )  # fmt: skip
+            flies = ~self._done  # a row that is done begins anew in this step, whatever the action
+            seen.append((self._observations[flies][:, self._columns] - self._mean) / self._scale)
+            wanted.append(hover_outputs(labels[flies], self.task))
+            self._observations, reward, terminated, truncated, _ = self.env.step(actions)
+            rewards.append(reward[flies])
+            # A team begins anew when all of its vehicles are done.
+            self._begins = np.repeat(self._done.reshape(-1, self._size).all(axis=1), self._size)
+            self._done = terminated | truncated
+        return np.concatenate(seen), np.concatenate(wanted), float(np.concatenate(rewards).mean())
+
+
+class Labels:
+    """All labels so far, in arrays that grow by doubling."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        self.count = 0
+        self._x, self._y = np.empty((4096, inputs), np.float32), np.empty((4096, outputs), np.float32)
+
+    def add(self, x: Floats, y: Floats) -> None:
+        """Append rows."""
+        last = self.count + len(x)
+        while last > len(self._x):
+            self._x, self._y = (np.concatenate([part, np.empty_like(part)]) for part in (self._x, self._y))
+        self._x[self.count : last], self._y[self.count : last] = x, y
+        self.count = last
+
+    def draw(self, n: int, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+        """Rows at random, n of them."""
+        rows = rng.integers(0, self.count, n)
+        return torch.from_numpy(self._x[rows]), torch.from_numpy(self._y[rows])
+
+
+def make_expert(name: str, task: BaseTask) -> Policy:
+    """The policy to imitate.
+
+    Raises:
+        ValueError: If it is unknown, sees more than observations, or remembers what a network cannot.
+    """
+    mission = mission_of(task)
+    if not name and mission not in _EXPERTS:
+        raise ValueError(
+            f"dagger has no expert for {mission} tasks: what cooperative-mpc knows of the target is in its "
+            "filter, not in an observation; ppo trains there"
+        )
+    expert = make_policy(name or _EXPERTS[mission], task)
+    if is_privileged(expert):
+        raise ValueError(
+            f"expert {name!r} decides from the whole truth, a network from observations; choose another"
+        )
+    return expert
+
+
+def train(
+    task_options: TrackingOptions | TeamOptions,
+    options: DaggerOptions,
+    seed: int,
+    spent: Callable[[], float],
+    start: Network | None = None,
+) -> Iterator[tuple[Progress, Network]]:
+    """Train, and yield after each window.
+
+    Args:
+        task_options: Of the environment.
+        options: Hyperparameters.
+        seed: Of everything random.
+        spent: Share of the budget that is used up, 0 to 1; training ends at 1.
+        start: To go on from; a new network if not given.
+
+    Raises:
+        ValueError: If the expert is not allowed.
+        TrainingError: If the loss is not finite.
+    """
+    torch.manual_seed(seed)
+    flights = LabelledFlights(
+        task_options, make_expert(options.expert, task_options.make_task()), options.rows, seed
+    )
+    features, outputs = flights.features, flights.outputs
+    actor = Actor(len(features.names), options.hidden, outputs)
+    if start is not None:
+        actor.load(start)
+    labels, rng = Labels(len(features.names), outputs), np.random.default_rng([_STREAM, seed, 1])
+    optimizer = torch.optim.Adam(actor.parameters, lr=options.learning_rate)
+    network, update = Network(features, *actor.arrays()), 0
+    while (share := spent()) < 1.0:
+        beta = 0.0 if options.expert_flies <= 0.0 else max(0.0, 1.0 - share / options.expert_flies)
+        x, y, reward = flights.collect(network, beta, options.window)
+        labels.add(x, y)
+        for group in optimizer.param_groups:
+            group["lr"] = options.learning_rate * (1.0 - (1.0 - options.final_rate) * share)
+        update += 1
+        fits = round(options.fits + share * (options.final_fits - options.fits))
+        loss = _fit(actor, optimizer, labels, options, fits, rng)
+        if not np.isfinite(loss):
+            raise TrainingError(f"the loss is {loss} at update {update}: the last good policy is kept")
+        network = Network(features, *actor.arrays())
+        yield Progress(update, labels.count, reward), network
+
+
+def _fit(
+    actor: Actor,
+    optimizer: torch.optim.Optimizer,
+    labels: Labels,
+    options: DaggerOptions,
+    fits: int,
+    rng: np.random.Generator,
+) -> float:
+    """Some minibatches; the last loss."""
+    loss = torch.zeros(())
+    for _ in range(fits):
+        x, y = labels.draw(options.batch, rng)
+        optimizer.zero_grad()
+        loss = torch.nn.functional.huber_loss(actor(x), y, delta=options.threshold)
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+    return float(loss)
