@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -223,10 +224,16 @@ RULES: dict[str, dict[str, Any]] = {
 MEETINGS = ((0.5, 2, 20), (1.0, 2, 20), (2.0, 2, 20), (1.0, 6, 8))
 
 
+@cache
+def head_on(rule: str, case: tuple[float, int, int]) -> Array:
+    """Smallest distance of each run of one of MEETINGS under one of RULES, m."""
+    return meet(RULES[rule], *case).gap
+
+
 def separation_claims(jobs: int = 1) -> list[Claim]:
     """Eqs. (5.7), (5.8): no two vehicles are ever nearer than d_s; head-on, and from a dense line."""
     rules = ("none", "text, sign fixed", "default")
-    gaps = {rule: [meet(RULES[rule], *case).gap for case in MEETINGS] for rule in rules}
+    gaps = {rule: [head_on(rule, case) for case in MEETINGS] for rule in rules}
     dense = [[0.0, 0.7 * y, 0.0] for y in range(6)]
     flights = [
         formation("triangle", "weak", "static", policy, start=dense)

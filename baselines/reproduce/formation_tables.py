@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .formation_claims import MEETINGS, RULES, UNION, formation, switched
-from .meetings import meet
+from .formation_claims import MEETINGS, UNION, formation, head_on, switched
 from .results import Measured
 from .team_flights import FROZEN, NO_ROWS, TeamFlight, fly_teams
 
@@ -110,10 +109,9 @@ def head_on_table(jobs: int = 1) -> list[Measured]:
     """Vehicles that exchange places, N = 5."""
     cells = []
     for rule, row in _HEAD_ON.items():
-        for (speed, vehicles, runs), before in zip(MEETINGS, row, strict=True):
-            found = meet(RULES[rule], speed, vehicles, runs)
-            where = f"{vehicles} meet at {speed:g} m/s, {rule}"
-            cells.append(Measured(where, "least gap, m", before, float(found.gap.min())))
+        for case, before in zip(MEETINGS, row, strict=True):
+            where = f"{case[1]} meet at {case[0]:g} m/s, {rule}"
+            cells.append(Measured(where, "least gap, m", before, float(head_on(rule, case).min())))
     return cells
 
 
