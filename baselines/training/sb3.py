@@ -308,6 +308,10 @@ def _unsound(model: PPO | SAC) -> str | None:
             return f"{name.removeprefix('train/').replace('_', ' ')} is {value}"
     if not all(bool(torch.isfinite(parameter).all()) for parameter in model.policy.parameters()):
         return "a weight is not finite"
+    if isinstance(model, PPO):
+        noise = model.policy.log_std.detach().exp()
+        if not bool((torch.isfinite(noise) & (noise > 0.0)).all()):
+            return f"the standard deviation of an action is {float(noise.max())}"
     return None
 
 

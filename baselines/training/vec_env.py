@@ -129,7 +129,7 @@ class TrainingVecEnv(VecEnv):
         for group in range(self._n):
             self._begin(group)
         steps = self.task.episode_steps
-        self._cut[:] = self._stagger.integers(1, steps + 1, self._n) if self._staggered else steps + 1
+        self._cut[:] = self._stagger.integers(1, steps + 1, self._n) if self._staggered else 0  # never
         self.costs, self.violated = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=np.bool_)
         return self._scaled(self._out)
 
