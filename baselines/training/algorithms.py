@@ -58,7 +58,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     "ppo": Algorithm(
         ".sb3",
         "train_ppo",
-        "PPOOptions",
+        "PpoOptions",
         "model-free",
         (TRACKING, FORMATION, TARGET),
         "proximal policy optimisation on the shared reward",
@@ -68,7 +68,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     "ppo-lagrangian": Algorithm(
         ".sb3",
         "train_ppo_lagrangian",
-        "PPOLagrangianOptions",
+        "PpoLagrangianOptions",
         "model-free",
         (TRACKING, FORMATION, TARGET),
         "the same, with a multiplier that holds the share of violating steps under a limit",
@@ -78,7 +78,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     "sac": Algorithm(
         ".sb3",
         "train_sac",
-        "SACOptions",
+        "SacOptions",
         "model-free",
         (TRACKING,),
         "soft actor-critic on the shared reward",

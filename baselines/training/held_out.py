@@ -38,6 +38,9 @@ class Point(NamedTuple):
     training_reward: float  # mean of the last update, as the algorithm saw it
 
 
+WHOLE = ("steps", "updates", "crashes", "flights")  # fields of a Point that are whole numbers
+
+
 def training_options(env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
     """The options of an environment as a value, from its id and keyword arguments.
 

@@ -211,4 +211,4 @@ def _fit(
         loss = torch.nn.functional.huber_loss(actor(x), y, delta=options.threshold)
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
-    return float(loss)
+    return float(loss.detach())

@@ -1,0 +1,222 @@
+"""Checkpoints of networks: what is written, what is refused, and how a policy comes out of one."""
+
+import json
+import os
+import pickle
+import subprocess
+import sys
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from baselines import CheckpointError, check_policy, evaluate, load_policy, make_policy, shipped_policies
+from baselines.environments import make_env, task_of
+from baselines.training import Network, NetworkPolicy, load_checkpoint, save_checkpoint
+from baselines.training.networks import default_features, hover_actions, hover_outputs
+
+HELIX, FORMATION = "quad/HelixTracking-v0", "quad/Formation-v0"
+ABOUT = {"env_id": HELIX, "mission": "tracking", "algorithm": "apg", "kind": "model-based", "score": 0.5}
+
+
+def network_for(env_id=HELIX, seed=0, outputs=4, **changes):
+    features, rng = default_features(task_of(env_id).layout), np.random.default_rng(seed)
+    sizes = (len(features.names), 16, 8, outputs)
+    pairs = list(pairwise(sizes))
+    weights = [(rng.normal(size=pair) / np.sqrt(pair[0])).astype(np.float32) for pair in pairs]
+    biases = [0.1 * rng.normal(size=m).astype(np.float32) for _, m in pairs]
+    return Network(features, tuple(weights), tuple(biases), **changes)
+
+
+@pytest.fixture
+def saved(tmp_path):
+    save_checkpoint(tmp_path / "run", network_for(), ABOUT)
+    return tmp_path / "run"
+
+
+def observations(rows=3):
+    env = make_env(HELIX)
+    return np.stack([env.reset(seed=seed)[0] for seed in range(rows)])
+
+
+def test_a_network_comes_back_as_it_was(saved):
+    network, said = load_checkpoint(saved)
+    for found, written in zip(
+        (*network.weights, *network.biases), (*network_for().weights, *network_for().biases), strict=True
+    ):
+        assert np.array_equal(found, written) and found.dtype == np.float32
+    assert network.features == network_for().features and said["env_id"] == HELIX
+    assert said["versions"]["python"] and said["layers"][-1] == [8, 4]
+
+
+def test_a_folder_is_a_policy_like_any_other(saved):
+    policy = make_policy(str(saved), HELIX)
+    check_policy(policy, HELIX)
+    assert policy.name == "run" and policy.kind == "model-based"
+    assert evaluate(make_policy(saved, HELIX), HELIX, 1).policy == "run"
+    assert pickle.loads(pickle.dumps(policy)).predict(observations())[0].shape == (3, 4)
+
+
+def test_what_a_network_computes_is_its_layers_on_scaled_features():
+    network, task, seen = network_for(), task_of(HELIX), observations()
+    features, x = network.features, seen[:, network_for().features.columns(task.layout)].astype(np.float64)
+    x = (x - features.mean) / features.scale
+    for W, b in zip(network.weights, network.biases, strict=True):
+        x = np.tanh(x @ W + b)
+    expected = hover_actions(x.astype(np.float32), task)
+    # Products of float32 are rounded: 1e-6 of numbers of order one, a few times over.
+    assert np.allclose(NetworkPolicy(network, task, "x").predict(seen)[0], expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("squash", ["tanh", "clip"])
+@pytest.mark.parametrize("commands", ["hover", "action"])
+def test_few_rows_get_the_same_as_many(squash, commands):
+    policy = NetworkPolicy(network_for(squash=squash, commands=commands), task_of(HELIX), "x")
+    many = np.tile(observations(2), (50, 1)) * np.linspace(0.5, 5.0, 100, dtype=np.float32)[:, None]
+    together = policy.predict(many)[0]
+    one_by_one = np.concatenate([policy.predict(row[None])[0] for row in many])
+    assert np.abs(together).max() > 0.5  # and not all on the linear part
+    assert np.allclose(together, one_by_one, atol=1e-5)  # other order of sums in float32
+
+
+@pytest.mark.parametrize("rows", [1, 50])
+def test_an_observation_that_is_not_finite_is_refused_by_name(rows):
+    seen = np.tile(observations(1), (rows, 1))
+    seen[-1, 2] = np.nan
+    with pytest.raises(ValueError, match=rf"observation {rows - 1} is not finite: V_B\[2\] is nan"):
+        NetworkPolicy(network_for(), task_of(HELIX), "x").predict(seen)
+
+
+def test_outputs_and_actions_turn_into_each_other():
+    outputs, task = np.linspace(-1.0, 1.0, 12, dtype=np.float32).reshape(3, 4), task_of(HELIX)
+    # A third and three times a third in float32.
+    assert np.allclose(hover_outputs(hover_actions(outputs, task), task), outputs, atol=1e-6)
+    assert hover_outputs(np.ones((1, 4), np.float32), task).max() == 1.0
+
+
+def test_a_network_flies_where_the_layout_has_what_it_sees(saved):
+    env = make_env("quad/RandomTracking-v0", preview=30)
+    assert make_policy(saved, env).predict(env.reset(seed=0)[0])[0].shape == (4,)
+
+
+def test_loading_and_flying_need_no_torch(saved):
+    code = (
+        "import sys; sys.modules['torch'] = sys.modules['stable_baselines3'] = None\n"
+        "from baselines.__main__ import main\n"
+        f"sys.exit(main(['evaluate', '{HELIX}', {str(saved)!r}, '--episodes', '1']))"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert found.returncode == 0 and found.stdout.startswith("run on quad/HelixTracking-v0"), found.stderr
+
+
+def describe(folder, **changes):
+    path = folder / "policy.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def truncate(folder):
+    path = folder / "network.safetensors"
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+class Trap:
+    """Pickled, it would make a file when it is opened."""
+
+    def __reduce__(self):
+        return os.mkdir, ("opened",)
+
+
+def pickle_in_disguise(folder):
+    (folder / "network.safetensors").write_bytes(pickle.dumps({"weights": Trap()}))
+
+
+def not_finite(folder):
+    from safetensors.numpy import load_file, save_file
+
+    from baselines.training.checkpoints import _digest
+
+    tensors = load_file(folder / "network.safetensors")
+    tensors["1.weight"][0, 0] = np.nan
+    save_file(tensors, folder / "network.safetensors")
+    describe(folder, digest=_digest((folder / "network.safetensors").read_bytes()))
+
+
+def wrong_shapes(folder):
+    from safetensors.numpy import load_file, save_file
+
+    from baselines.training.checkpoints import _digest
+
+    tensors = load_file(folder / "network.safetensors")
+    tensors["1.weight"] = tensors["1.weight"][:5].copy()
+    save_file(tensors, folder / "network.safetensors")
+    describe(folder, digest=_digest((folder / "network.safetensors").read_bytes()))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda folder: describe(folder, format=2), "has format 2, this version reads 1"),
+        (lambda folder: describe(folder, mission="formation", env_id=FORMATION), "trained on quad/Formation"),
+        (lambda folder: describe(folder, digest="0"), "describes other weights"),
+        (lambda folder: (folder / "policy.json").write_text("[1"), "is not valid JSON"),
+        (lambda folder: (folder / "policy.json").unlink(), "cannot read policy.json"),
+        (lambda folder: (folder / "network.safetensors").unlink(), "cannot read network.safetensors"),
+        (truncate, "not a safetensors file, or truncated"),
+        (pickle_in_disguise, "pickles are never opened"),
+        (not_finite, "layer 1 of a network is not finite"),
+        (wrong_shapes, "layer 1 of a network must take 16 inputs"),
+    ],
+)
+def test_anything_else_is_refused(saved, monkeypatch, tmp_path, spoil, message):
+    monkeypatch.chdir(tmp_path)
+    spoil(saved)
+    with pytest.raises(CheckpointError, match=message):
+        make_policy(saved, HELIX)
+    assert not (tmp_path / "opened").exists()
+
+
+def test_a_network_that_sees_what_is_not_there_is_refused(saved):
+    with pytest.raises(CheckpointError, match=r"does not fit .* the network sees preview\[14\]"):
+        make_policy(saved, make_env(HELIX, preview=10))
+
+
+def test_a_network_with_other_actions_is_refused(tmp_path):
+    save_checkpoint(tmp_path / "wide", network_for(outputs=6), ABOUT)
+    with pytest.raises(CheckpointError, match="gives 6 numbers, an action of this task has 4"):
+        load_policy(tmp_path / "wide", HELIX)
+
+
+def test_a_file_of_another_library_is_not_opened(tmp_path):
+    path = tmp_path / "model.zip"
+    path.write_bytes(pickle.dumps(Trap()))
+    with pytest.raises(CheckpointError, match="are pickles, which are never opened"):
+        make_policy(str(path), HELIX)
+
+
+def test_a_folder_that_is_not_there_is_said_to_be_so():
+    with pytest.raises(CheckpointError, match="there is no folder 'runs/nowhere'"):
+        make_policy("runs/nowhere", HELIX)
+    with pytest.raises(ValueError, match="or the folder of a trained one"):
+        make_policy("nowhere", HELIX)
+
+
+def test_a_trained_policy_has_no_options(saved):
+    with pytest.raises(ValueError, match="a trained policy has no options, got horizon"):
+        make_policy(saved, HELIX, horizon=3)
+
+
+def test_a_full_disk_leaves_the_checkpoint_before_whole(saved, monkeypatch):
+    def full(path, data):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("baselines.training.checkpoints.write_atomic", full)
+    with pytest.raises(CheckpointError, match=r"No space left on device.*the one before it"):
+        save_checkpoint(saved, network_for(seed=1), ABOUT)
+    assert np.array_equal(load_checkpoint(saved)[0].weights[0], network_for().weights[0])
+    assert sorted(path.name for path in saved.iterdir()) == ["network.safetensors", "policy.json"]
+
+
+def test_shipped_policies_go_by_name(saved, monkeypatch):
+    monkeypatch.setattr("baselines.trained.SHIPPED", saved.parent)
+    assert shipped_policies() == {"run": "apg (model-based) on quad/HelixTracking-v0, score 0.500"}
+    assert make_policy("run", HELIX).name == "run"

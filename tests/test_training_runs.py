@@ -1,0 +1,377 @@
+"""Training runs: budgets, curves, what the folder holds, how they end and go on. The algorithms are stubs."""
+
+import csv
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from baselines import CheckpointError, ResultsError, TrainingError, evaluate, make_policy, train
+from baselines.__main__ import main
+from baselines.errors import MissingPackageError
+from baselines.options import TrainOptions
+from baselines.results import locked
+from baselines.train_command import resume_command
+from baselines.training import Network, load_checkpoint, networks
+from baselines.training.algorithms import ALGORITHMS, Algorithm, options_of
+from baselines.training.clock import Budget
+from baselines.training.held_out import CHOOSING, Point, better, training_options
+from baselines.training.hyperparameters import hyperparameter_file, hyperparameters
+from baselines.training.watching import Display
+from quad_envs.registration import TEAMS, TRACKING
+
+HELIX = "quad/HelixTracking-v0"
+SHORT = {"time_limit": 1.0}  # 20 steps
+
+
+@dataclass(frozen=True, slots=True)
+class StubOptions:
+    """Of the stub."""
+
+    gain: float = 1.0
+    hidden: tuple[int, ...] = (4,)
+    rows: int = 100
+    fails_at: int = 0
+    how: str = ""
+
+
+class Progress(NamedTuple):
+    update: int
+    steps: int
+    reward: float
+
+
+def stub(task_options, options, seed, spent, start=None):
+    """Each update draws another network around hover; after `fails_at` of them something happens."""
+    task, rng, update = task_options.make_task(), np.random.default_rng(seed), 0
+    features = networks.default_features(task.layout)
+    while spent() < 1.0:
+        update += 1
+        if update == options.fails_at:
+            if options.how == "interrupt":
+                raise KeyboardInterrupt
+            if options.how == "training":
+                raise TrainingError("the loss is nan")
+        bias = np.full(4, np.nan if options.how == "nan" and update == options.fails_at else 0.0)
+        bias += options.gain * rng.normal(size=4) / (1 + update)
+        weights = np.zeros((len(features.names), 4), np.float32)
+        reward = np.inf if options.how == "infinite" and update == options.fails_at else 0.5
+        yield (
+            Progress(update, options.rows * update, reward),
+            Network(features, (weights,), (bias.astype(np.float32),)),
+        )
+        if start is not None:
+            assert len(start.weights) == 1
+
+
+def once_only(task_options, options, seed, spent):
+    """The same, and it cannot go on."""
+    return stub(task_options, options, seed, spent)
+
+
+@pytest.fixture(autouse=True)
+def stubs(monkeypatch):
+    entry = Algorithm(
+        __name__, "stub", "StubOptions", "imitation", ("tracking", "formation"), "a stub", 2.0, ()
+    )
+    monkeypatch.setitem(ALGORITHMS, "stub", entry)
+    monkeypatch.setitem(ALGORITHMS, "once", entry._replace(generator="once_only"))
+
+
+def run(out, steps=1000, **changes):
+    return train(
+        HELIX,
+        changes.pop("algorithm", "stub"),
+        **{"steps": steps, "env_kwargs": SHORT, "out": out, **changes},
+    )
+
+
+def test_a_run_leaves_a_checkpoint_a_curve_and_what_made_them(tmp_path):
+    result = run(tmp_path / "run", seed=3)
+    folder = result.folder
+    _, said = load_checkpoint(folder)
+    assert (said["algorithm"], said["env_id"], said["seed"], said["mission"]) == (
+        "stub",
+        HELIX,
+        3,
+        "tracking",
+    )
+    assert said["score"] == result.best.score == max(point.score for point in result.curve)
+    rows = list(csv.DictReader((folder / "curve.csv").read_text().splitlines()))
+    assert [float(row["score"]) for row in rows] == [point.score for point in result.curve]
+    assert set(rows[0]) == set(Point._fields)
+    config = json.loads((folder / "config.json").read_text())
+    assert {"command", "versions", "git_revision", "hyperparameters", "env_kwargs"} <= set(config)
+    assert load_checkpoint(folder / "last")[1]["steps"] == 1000 == result.curve[-1].steps
+
+
+def test_the_recorded_score_is_that_of_its_starts(tmp_path):
+    result = run(tmp_path / "run")
+    policy = make_policy(result.folder, HELIX)
+    starts = load_checkpoint(result.folder)[1]["starts"]
+    import gymnasium
+
+    env = gymnasium.make_vec(HELIX, num_envs=starts["flights"], **SHORT)
+    found = evaluate(policy, env, starts["flights"], starts["seed"])
+    # One network, sums in float32 in another order for another number of rows.
+    assert found.summary()["score"].mean == pytest.approx(result.best.score, rel=1e-5)
+    assert starts["seed"] == CHOOSING
+
+
+def test_equal_seeds_and_steps_give_equal_runs(tmp_path):
+    first, second, other = (run(tmp_path / name, seed=seed) for name, seed in (("a", 1), ("b", 1), ("c", 2)))
+    plain = [[point._replace(cpu_seconds=0.0) for point in result.curve] for result in (first, second, other)]
+    assert str(plain[0]) == str(plain[1]) != str(plain[2])
+    assert np.array_equal(
+        load_checkpoint(tmp_path / "a")[0].biases[0], load_checkpoint(tmp_path / "b")[0].biases[0]
+    )
+
+
+def test_a_budget_in_seconds_ends_and_evaluation_is_not_in_it(tmp_path):
+    begin = time.process_time()
+    result = run(tmp_path / "run", steps=None, seconds=0.3)
+    assert 0.3 <= result.curve[-1].cpu_seconds < 0.4 < time.process_time() - begin
+
+
+def test_a_team_trains_with_agents_as_rows(tmp_path):
+    result = train("quad/Formation-v0", "stub", steps=200, env_kwargs=SHORT, out=tmp_path / "run")
+    assert result.best.flights == 30 and load_checkpoint(tmp_path / "run")[1]["mission"] == "formation"
+
+
+def test_an_interrupted_run_saves_and_goes_on(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, hyper={"fails_at": 6, "how": "interrupt"})
+    assert load_checkpoint(tmp_path / "last")[1]["updates"] == 5
+    result = run(tmp_path, hyper={"fails_at": 6, "how": "interrupt"}, resume=True, steps=900)
+    assert [point.updates for point in result.curve][-1] == 9 and result.curve[-1].steps == 900
+    assert [point.steps for point in result.curve] == sorted({point.steps for point in result.curve})
+    config = json.loads((tmp_path / "config.json").read_text())
+    assert len(config["commands"]) == 1 and load_checkpoint(tmp_path / "last")[1]["resumed"] == 1
+
+
+def test_a_finished_run_goes_on_with_a_larger_budget_only(tmp_path):
+    first = run(tmp_path)
+    with pytest.raises(ResultsError, match=r"has used .* all of 1000 steps: give more"):
+        run(tmp_path, resume=True)
+    second = run(tmp_path, resume=True, steps=1500)
+    assert str(second.curve[: len(first.curve)]) == str(first.curve) and second.curve[-1].steps == 1500
+    assert second.best.score >= first.best.score
+
+
+@pytest.mark.parametrize("how", ["training", "nan", "infinite"])
+def test_a_training_that_diverges_keeps_the_last_good_policy_and_says_when(tmp_path, how):
+    with pytest.raises(TrainingError, match=r"stopped at update \d+: .* kept in"):
+        run(tmp_path, hyper={"fails_at": 4, "how": how})
+    network, said = load_checkpoint(tmp_path / "last")
+    assert np.isfinite(network.biases[0]).all() and said["updates"] in (3, 4)
+    assert make_policy(tmp_path, HELIX)
+
+
+def test_a_full_disk_keeps_what_was_saved_and_is_said_at_the_end(tmp_path, monkeypatch):
+    run(tmp_path)
+    before = (tmp_path / "last" / "network.safetensors").read_bytes()
+    notes = []
+
+    class Watch(Display):
+        def noted(self, text):
+            notes.append(text)
+
+    def full(path, data):
+        raise ResultsError("No space left on device")
+
+    monkeypatch.setattr("baselines.training.checkpoints.write_atomic", full)
+    with pytest.raises(CheckpointError, match="No space left"):
+        run(tmp_path, steps=1500, resume=True, watcher=Watch("x", io.StringIO()))
+    assert (tmp_path / "last" / "network.safetensors").read_bytes() == before
+    assert notes and "training goes on" in notes[0]
+
+
+def test_one_run_at_a_time_in_a_folder(tmp_path):
+    with locked(tmp_path), pytest.raises(ResultsError, match="is in use by process"):
+        run(tmp_path)
+
+
+def test_a_folder_with_a_run_is_not_overwritten_unasked(tmp_path):
+    run(tmp_path)
+    with pytest.raises(ResultsError, match=r"--resume.*--fresh"):
+        run(tmp_path)
+    assert run(tmp_path, seed=1, fresh=True).seed == 1
+    with pytest.raises(ResultsError, match="its seed is 1, asked for is 2"):
+        run(tmp_path, seed=2, resume=True)
+    with pytest.raises(ResultsError, match="its hyperparameters is"):
+        run(tmp_path, seed=1, hyper={"gain": 2.0}, resume=True)
+
+
+def test_files_of_others_are_left_alone(tmp_path):
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(ResultsError, match="no training has written"):
+        run(tmp_path, fresh=True)
+    with pytest.raises(ResultsError, match="holds no training"):
+        run(tmp_path / "new", resume=True)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"seed": -1}, "seed of a training must be"),
+        ({"seed": 20_000}, "held out for evaluation"),
+        ({"seconds": 3.0}, "either seconds .* or steps"),
+        ({"steps": 0}, "steps of training must be a whole number > 0"),
+        ({"steps": None, "seconds": float("nan")}, "seconds of training must be a number > 0"),
+        ({"resume": True, "fresh": True}, "either resume or fresh"),
+        ({"algorithm": "stubb"}, "did you mean 'stub'"),
+        ({"hyper": {"gian": 1.0}}, "hyperparameter of 'stub' 'gian'; did you mean 'gain'"),
+        ({"hyper": {"gain": "big"}}, "gain of 'stub' must be a number, got 'big'"),
+        ({"hyper": {"rows": 1.5}}, "rows of 'stub' must be a whole number"),
+        ({"hyper": {"hidden": 3}}, "hidden of 'stub' must be a list"),
+        ({"env_kwargs": {"kapa": 1.0}}, "did you mean 'kappa'"),
+        ({"algorithm": "once", "resume": True}, "'once' cannot go on from a saved network"),
+    ],
+)
+def test_bad_input_is_refused_before_anything_is_written(tmp_path, arguments, message):
+    with pytest.raises((ValueError, ResultsError), match=message):
+        run(tmp_path / "run", **arguments)
+    assert not (tmp_path / "run" / "config.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("env_id", "algorithm", "message"),
+    [
+        ("quad/Formation-v0", "sac", "those that can act there: dagger, ppo, ppo-lagrangian"),
+        ("quad/Formation-v0", "apg", "trains on tracking tasks, not on formation"),
+        ("quad/TargetTracking-v0", "dagger", "not on target-tracking"),
+        ("quad/CooperativeEstimation-v0", "ppo", "its agents estimate and do not fly"),
+        ("quad/Helix-v0", "apg", "did you mean 'quad/HelixTracking-v0'"),
+    ],
+)
+def test_an_algorithm_that_cannot_act_there_is_refused(tmp_path, env_id, algorithm, message):
+    with pytest.raises(ValueError, match=message):
+        train(env_id, algorithm, steps=100, out=tmp_path)
+
+
+def test_a_missing_package_is_named_with_its_extra(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(ALGORITHMS, "stub", ALGORITHMS["stub"]._replace(packages=("no_such_torch",)))
+    with pytest.raises(
+        MissingPackageError, match=r'no_such_torch, which is not installed: pip install "quad-envs\[rl\]"'
+    ):
+        run(tmp_path)
+    assert main(["train", HELIX, "stub", "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_the_best_policy_is_under_the_limit_if_there_is_one():
+    point = Point(1.0, 1, 1, 0.5, 1.0, 0.2, 0, 20, 0.5)
+    safe, bold = point._replace(score=0.4, violation_share=0.01), point._replace(score=0.6)
+    assert better(bold, point) and not better(safe, point)
+    assert better(safe, point, 0.05) and not better(bold, safe, 0.05) and better(bold, point, 0.05)
+
+
+def test_hyperparameters_come_from_the_committed_files():
+    for algorithm in set(ALGORITHMS) - {"stub", "once"}:
+        known = {*TRACKING, *TEAMS, "default"}
+        assert set(hyperparameter_file(algorithm)) <= known
+        for env_id in known - {"default"}:
+            assert isinstance(hyperparameters(algorithm, env_id), options_of(algorithm))
+
+
+def test_a_task_is_the_one_of_its_id():
+    for env_id in (*TRACKING, *TEAMS):
+        assert training_options(env_id, {}).make_task().env_id == env_id
+
+
+def test_the_command_prints_the_best_and_a_line_per_evaluation(tmp_path, capsys):
+    arguments = [
+        "train",
+        HELIX,
+        "stub",
+        "--steps",
+        "500",
+        "--out",
+        str(tmp_path / "a"),
+        "--set",
+        "time_limit=1.0",
+    ]
+    assert main(arguments) == 0
+    out, err = capsys.readouterr()
+    assert out.startswith("best of ") and out.count("\n") == 1 and "score" in out
+    assert err.count("CPU-s") == 5 and f"quad-envs evaluate {HELIX}" in err and "%|" not in err
+    assert main([*arguments, "--fresh", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["best"]["flights"] == 20
+    assert main(["evaluate", HELIX, str(tmp_path / "a"), "--episodes", "1", "--set", "time_limit=1.0"]) == 0
+
+
+def test_a_terminal_gets_a_bar():
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    stream = Terminal()
+    display = Display("apg", stream)
+    display.judged(Point(1.0, 100, 1, 0.5, 1.0, 0.2, 0, 20, 0.5), True)
+    display.updated(0.5, None)
+    display._bar.refresh()
+    display.close()
+    assert "score 0.500, violations 20.0 %" in stream.getvalue() and "left" in stream.getvalue()
+
+
+def test_a_diverged_training_ends_with_code_1(tmp_path, capsys):
+    arguments = ["--hyper", "fails_at=3", "--hyper", "how=training", "--steps", "500"]
+    assert main(["train", HELIX, "stub", "--out", str(tmp_path), *arguments]) == 1
+    assert "stopped at update 3: the loss is nan" in capsys.readouterr().err
+
+
+def test_ctrl_c_says_how_to_go_on(tmp_path, capsys):
+    out = tmp_path / "my run"
+    arguments = [
+        "train",
+        HELIX,
+        "stub",
+        "--steps",
+        "500",
+        "--hyper",
+        "fails_at=3",
+        "--hyper",
+        "how=interrupt",
+    ]
+    assert main([*arguments, "--out", str(out)]) == 130
+    said = capsys.readouterr().err.splitlines()[-1]
+    command = resume_command(
+        TrainOptions(HELIX, "stub", steps=500, hyper=["fails_at=3", "how=interrupt"]), out
+    )
+    assert said.endswith(command) and command.endswith("--resume") and f"'{out}'" in command
+
+
+def test_a_budget_counts_one_thing():
+    assert Budget(seconds=10.0).share(5.0, 10**9) == 0.5 and Budget(steps=10).share(99.0, 5) == 0.5
+
+
+@pytest.mark.slow
+def test_ctrl_c_in_a_process_of_its_own(tmp_path):
+    command = [
+        sys.executable,
+        "-m",
+        "baselines",
+        "train",
+        HELIX,
+        "apg",
+        "--seconds",
+        "500",
+        "--out",
+        str(tmp_path),
+    ]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    for line in process.stderr:
+        if "score" in line:
+            break
+    os.kill(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and "Resume with: quad-envs train" in err and "Traceback" not in err
+    assert make_policy(tmp_path, HELIX)
