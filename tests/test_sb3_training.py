@@ -178,17 +178,22 @@ def test_costs_and_violations_of_the_last_step_are_there():
 
 def test_a_multiplier_rises_above_its_limit_and_falls_to_zero_below():
     multiplier = Multiplier(limit=0.1, proportional=1.0, integral=2.0)
-    multiplier.update(0.3)
-    multiplier.update(0.3)
-    assert multiplier.value == pytest.approx(0.2 + 2 * 2.0 * 0.2)
+    multiplier.update(0.15)
+    multiplier.update(0.9)  # counts as twice the limit
+    assert multiplier.value == pytest.approx(1.0 + 2.0 * (0.5 + 1.0))
     for _ in range(20):
         multiplier.update(0.0)
     assert multiplier.value == 0.0
 
 
+def test_a_limit_of_zero_is_refused():
+    with pytest.raises(ValueError, match=r"limit is a share of steps, above 0 and at most 1, got 0"):
+        Multiplier(0.0, 1.0, 1.0)
+
+
 def test_penalised_rewards_stay_in_the_unit_interval_and_a_crash_earns_nothing():
     options = TrackingOptions.from_kwargs(TRACKING["quad/CorridorTracking-v0"])
-    multiplier = Multiplier(0.0, 0.0, 50.0)
+    multiplier = Multiplier(0.1, 0.0, 50.0)
     multiplier.update(1.0)
     plain, flights = (TrainingVecEnv(options, 32, 0) for _ in range(2))
     env = LagrangianEnv(flights, multiplier)

@@ -22,15 +22,21 @@ from .vec_env import Bools, TrainingVecEnv
 class Multiplier:
     """Proportional-integral ascent on the multiplier (Stooke, Achiam and Abbeel, 2020).
 
+    The excess is relative to the limit and at most one, so that the many violations of a beginner do not
+    raise the multiplier until nothing is left of the reward.
+
     Args:
-        limit: Of the share of violating steps.
-        proportional: Multiplier per share above the limit.
+        limit: Of the share of violating steps, > 0.
+        proportional: Multiplier per relative excess.
         integral: The same, per update.
+
+    Raises:
+        ValueError: If a number is not in its range.
     """
 
     def __init__(self, limit: float, proportional: float, integral: float) -> None:
-        if not 0.0 <= limit <= 1.0:
-            raise ValueError(f"limit is a share of steps, 0 to 1, got {limit!r}")
+        if not 0.0 < limit <= 1.0:
+            raise ValueError(f"limit is a share of steps, above 0 and at most 1, got {limit!r}")
         if not (proportional >= 0.0 and integral > 0.0):
             raise ValueError(
                 f"a multiplier needs proportional >= 0 and integral > 0, got {proportional!r}, {integral!r}"
@@ -40,9 +46,9 @@ class Multiplier:
 
     def update(self, share: float) -> None:
         """Rise where the share of violating steps is above the limit, fall where it is below."""
-        error = share - self.limit
-        self._sum = max(0.0, self._sum + self.integral * error)
-        self.value = max(0.0, self._sum + self.proportional * error)
+        excess = min(share / self.limit - 1.0, 1.0)
+        self._sum = max(0.0, self._sum + self.integral * excess)
+        self.value = max(0.0, self._sum + self.proportional * excess)
 
 
 class LagrangianEnv(VecEnvWrapper):

@@ -54,8 +54,8 @@ class PpoLagrangianOptions(PpoOptions):
     """Hyperparameters of PPO with a bound on the share of violating steps."""
 
     limit: float = 0.01  # of the share of violating steps in training
-    proportional: float = 1.0  # multiplier per share above the limit
-    integral: float = 0.5  # the same, per update
+    proportional: float = 0.5  # multiplier per relative excess, which counts up to 1
+    integral: float = 0.02  # the same, per update
 
 
 @dataclass(frozen=True, slots=True)
