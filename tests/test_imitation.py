@@ -1,0 +1,141 @@
+"""Imitation and the analytic policy gradient: labels, who flies, and the scores that both reach."""
+
+import numpy as np
+import pytest
+
+from baselines import evaluate, make_policy, train
+from baselines.environments import make_env, task_of
+from baselines.training.held_out import CHOOSING, HELD_OUT, training_options
+from baselines.training.imitation import DaggerOptions, LabelledFlights, Labels, make_expert
+from baselines.training.imitation import train as dagger
+from baselines.training.networks import Network, default_features, hover_actions
+from baselines.training.policy_gradient import PolicyGradientOptions
+from baselines.training.policy_gradient import train as policy_gradient
+
+HELIX, RANDOM, FORMATION = "quad/HelixTracking-v0", "quad/RandomTracking-v0", "quad/Formation-v0"
+
+
+def still(task, outputs=4):
+    """A network that hovers."""
+    features = default_features(task.layout)
+    weights = np.zeros((len(features.names), outputs), np.float32)
+    return Network(features, (weights,), (np.zeros(outputs, np.float32),))
+
+
+def flights_of(env_id, expert, rows, seed=0, **kwargs):
+    options = training_options(env_id, kwargs)
+    return LabelledFlights(options, make_policy(expert, options.make_task()), rows, seed)
+
+
+@pytest.mark.parametrize(("env_id", "expert", "rows"), [(HELIX, "lqr", 5), (FORMATION, "consensus-mpc", 12)])
+def test_labels_are_what_the_expert_does_in_what_was_seen(env_id, expert, rows):
+    flights = flights_of(env_id, expert, rows)
+    seen = flights._observations.copy()
+    x, y, reward = flights.collect(still(flights.task), 1.0, 1)
+    wanted, _ = make_policy(expert, flights.task).predict(seen)
+    # The expert asks for more than twice the hover force nowhere here, so that nothing is cut off.
+    inside = np.abs(y) < 1.0
+    assert np.allclose(hover_actions(y, flights.task)[inside], wanted[inside], atol=1e-6)
+    assert np.allclose(x * flights._scale + flights._mean, seen[:, flights._columns], atol=1e-5)
+    assert len(x) == rows and 0.0 < reward < 1.0
+
+
+def test_the_share_of_rows_that_the_expert_flies_is_beta():
+    expert, learner = flights_of(HELIX, "lmpc", 20, seed=3), flights_of(HELIX, "lmpc", 20, seed=3)
+    rewards = [
+        expert.collect(still(expert.task), 1.0, 60)[2],
+        learner.collect(still(learner.task), 0.0, 60)[2],
+    ]
+    assert rewards[0] > 3.0 * rewards[1]
+
+
+def test_episodes_begin_anew_and_their_first_state_is_no_label_of_the_last_step():
+    flights = flights_of(HELIX, "lqr", 4, time_limit=0.5)  # 10 steps
+    x, _, _ = flights.collect(still(flights.task), 1.0, 22)
+    assert len(x) == 4 * 20  # in 2 of the 22 steps rows begin anew
+
+
+def test_rows_of_vehicles_that_crashed_give_no_labels():
+    flights = flights_of(FORMATION, "hover", 12, terminate="agent", time_limit=3.0)
+    flipping = still(flights.task)
+    flipping = Network(flipping.features, flipping.weights, (np.array([-1, -1, 1, 1], np.float32),))
+    x, _, _ = flights.collect(flipping, 0.5, 40)
+    assert 6 * 10 < len(x) < 12 * 40 and np.abs(x).max() < 100.0
+
+
+def test_labels_grow_and_are_all_drawn_from():
+    labels, rng = Labels(2, 1), np.random.default_rng(0)
+    for k in range(3):
+        labels.add(np.full((3000, 2), k, np.float32), np.full((3000, 1), k, np.float32))
+    x, y = labels.draw(1000, rng)
+    assert labels.count == 9000 and set(y[:, 0].tolist()) == {0.0, 1.0, 2.0} and bool((x[:, :1] == y).all())
+
+
+@pytest.mark.parametrize(
+    ("name", "env_id", "message"),
+    [
+        ("", "quad/TargetTracking-v0", "no expert for target-tracking tasks: what cooperative-mpc knows"),
+        ("central-mpc", FORMATION, "decides from the whole truth"),
+        ("nmcp", HELIX, "did you mean 'nmpc'"),
+        ("lmpc", FORMATION, "for tracking tasks, not for formation"),
+    ],
+)
+def test_who_cannot_be_imitated_is_refused(name, env_id, message):
+    with pytest.raises(ValueError, match=message):
+        make_expert(name, task_of(env_id))
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "options"),
+    [
+        (dagger, DaggerOptions(expert="lqr", rows=8, window=5, fits=2, final_fits=4)),
+        (policy_gradient, PolicyGradientOptions(flights=8, horizon=5)),
+    ],
+)
+def test_equal_seeds_give_equal_networks(algorithm, options):
+    def learn(seed, start=None):
+        count = iter(range(5))
+        updates = algorithm(training_options(HELIX, {}), options, seed, lambda: next(count) / 4, start)
+        return list(updates)
+
+    first, second, other = learn(1), learn(1), learn(2)
+    assert len(first) == 4 and first[-1][0] == second[-1][0]
+    for a, b, c in zip(first[-1][1].weights, second[-1][1].weights, other[-1][1].weights, strict=True):
+        assert np.array_equal(a, b) and not np.array_equal(a, c)
+    onward = learn(1, first[-1][1])[0][1].weights[0]
+    # Adam moves each weight by the learning rate and no more in an update.
+    assert np.abs(onward - first[-1][1].weights[0]).max() < 4.0 * 1.1e-2
+
+
+def test_a_network_with_other_layers_is_no_start():
+    wrong, steps = still(task_of(HELIX)), iter([0.0, 1.0])
+    with pytest.raises(ValueError, match="give the same hidden sizes"):
+        next(dagger(training_options(HELIX, {}), DaggerOptions(expert="lqr"), 0, lambda: next(steps), wrong))
+
+
+def test_training_flies_from_no_start_that_is_held_out():
+    flights = flights_of(HELIX, "hover", 64)
+    env = make_env(HELIX)
+    held_out = [
+        env.reset(seed=seed)[0] for first in (HELD_OUT, CHOOSING) for seed in range(first, first + 20)
+    ]
+    gap = np.abs(flights._observations[:, None] - np.stack(held_out)[None]).max(axis=2)
+    assert gap.min() > 1e-4
+
+
+def score(policy, env_id, flights=50):
+    return evaluate(make_policy(policy, env_id), env_id, flights, HELD_OUT).summary()["score"].mean
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_dagger_is_within_one_percent_of_its_expert_in_15_seconds(tmp_path, seed):
+    train(HELIX, "dagger", seed=seed, seconds=15, out=tmp_path)
+    assert score(tmp_path, HELIX) > 0.99 * score("sdc-nmpc", HELIX)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(5))
+def test_the_policy_gradient_passes_lmpc_in_10_seconds(tmp_path, seed):
+    train(HELIX, "apg", seed=seed, seconds=10, out=tmp_path)
+    assert score(tmp_path, HELIX) > score("lmpc", HELIX)
