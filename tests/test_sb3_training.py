@@ -191,25 +191,39 @@ def test_a_limit_of_zero_is_refused():
         Multiplier(0.0, 1.0, 1.0)
 
 
-def test_penalised_rewards_stay_in_the_unit_interval_and_a_crash_earns_nothing():
+def test_a_crash_pays_for_violations_for_ever():
     options = TrackingOptions.from_kwargs(TRACKING["quad/CorridorTracking-v0"])
-    multiplier = Multiplier(0.1, 0.0, 50.0)
+    multiplier = Multiplier(0.1, 0.0, 3.0)
     multiplier.update(1.0)
     plain, flights = (TrainingVecEnv(options, 32, 0) for _ in range(2))
-    env = LagrangianEnv(flights, multiplier)
+    env, crashes = LagrangianEnv(flights, multiplier, discount=0.98), 0
     plain.reset()
     env.reset()
-    rng = np.random.default_rng(0)
-    for _ in range(60):
-        outputs = random_outputs(rng, 32)
+    for _ in range(80):
+        outputs = np.full((32, 4), -0.9, dtype=np.float32)  # all fall
         _, rewards, dones, infos = plain.step(outputs)
         _, penalised, _, _ = env.step(outputs)
-        assert (penalised >= 0.0).all()
-        assert (penalised <= 1.0).all()
-        clean = ~plain.violated & (rewards > 0.0)
-        np.testing.assert_allclose(penalised[clean], (rewards[clean] + 50.0) / 51.0, rtol=1e-6)
         crashed = [i for i in np.flatnonzero(dones) if not infos[i]["TimeLimit.truncated"]]
-        assert (penalised[crashed] == 0.0).all()
+        others = np.setdiff1d(np.arange(32), crashed)
+        expected = (rewards - 3.0 * plain.violated) / 4.0
+        np.testing.assert_allclose(penalised[others], expected[others], rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(penalised[crashed], -3.0 / 4.0 / 0.02, rtol=1e-6)
+        crashes += len(crashed)
+    assert crashes > 0
+
+
+def test_the_multiplier_rests_while_training_is_free(monkeypatch):
+    seen = []
+    monkeypatch.setattr(Multiplier, "update", lambda self, share: seen.append(share))
+    task = TrackingOptions.from_kwargs(TRACKING["quad/CorridorTracking-v0"])
+    options = PpoLagrangianOptions(rows=4, horizon=8, batch=32, epochs=1, hidden=(8,), free=0.5)
+    share = [0.0]
+    generator = train_ppo_lagrangian(task, options, 0, lambda: share[0])
+    next(generator)
+    assert not seen
+    share[0] = 0.6
+    next(generator)
+    assert len(seen) == 1
 
 
 def test_numpy_tanh_has_the_values_and_gradients_of_torch():
@@ -312,6 +326,25 @@ def test_a_policy_with_other_layers_is_refused_as_a_start():
     _, start = first_updates(train_ppo(task, SMALL, 0, lambda: 0.0), 1)[-1]
     with pytest.raises(ValueError, match=r"layers \[.*16.*\].*go on with the algorithm"):
         next(train_ppo(task, replace(SMALL, hidden=(8, 8)), 0, lambda: 0.0, start))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rows": 0}, r"rows must be finite and positive, got 0"),
+        ({"learning_rate": float("nan")}, r"learning_rate must be finite and positive, got nan"),
+        ({"discount": 1.5}, r"discount must be at most 1, got 1.5"),
+        ({"hidden": ()}, r"hidden needs at least one layer"),
+    ],
+)
+def test_senseless_hyperparameters_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        replace(SMALL, **changes)
+
+
+def test_stages_beyond_the_preview_are_refused():
+    with pytest.raises(ValueError, match=r"the preview has stages 0 to 25, got \(0, 30\)"):
+        make_flights(TrackingOptions.from_kwargs({}), replace(SMALL, stages=(0, 30)), 0)
 
 
 def test_sac_is_refused_where_there_are_several_vehicles():

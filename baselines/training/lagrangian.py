@@ -1,11 +1,10 @@
 """A bound on the share of violating steps as a Lagrange multiplier on the reward.
 
 Maximise E[sum r_t] such that the share of violating steps is at most `limit`. Steps that a crash takes away
-count as violating, so that the penalised reward is
+count as violating, for ever, so that however large the multiplier m gets, crashing early never pays:
 
-    (r + m (1 - c)) / (1 + m),   c = 1 in a violating step, else 0,   m >= 0 the multiplier:
-
-it stays in [0, 1], and however large m gets, crashing early never pays.
+    (r - m c) / (1 + m),   c = 1 in a violating step, else 0,
+    -m / ((1 + m) (1 - gamma))   in the step of a crash.
 """
 
 from __future__ import annotations
@@ -57,11 +56,14 @@ class LagrangianEnv(VecEnvWrapper):
     Args:
         venv: The flights.
         multiplier: Read at every step.
+        discount: Of the learner, < 1.
     """
 
-    def __init__(self, venv: TrainingVecEnv, multiplier: Multiplier) -> None:
+    def __init__(self, venv: TrainingVecEnv, multiplier: Multiplier, discount: float) -> None:
         super().__init__(venv)
-        self.flights, self.multiplier = venv, multiplier
+        if not discount < 1.0:
+            raise ValueError(f"a multiplier on the cost needs a discount below 1, got {discount!r}")
+        self.flights, self.multiplier, self._ever = venv, multiplier, 1.0 / (1.0 - discount)
 
     def reset(self) -> Floats:
         """Begin all episodes."""
@@ -71,7 +73,5 @@ class LagrangianEnv(VecEnvWrapper):
         """One control period, with penalised rewards."""
         observations, rewards, dones, infos = self.flights.step_wait()
         m = self.multiplier.value
-        penalised = (rewards + m * ~self.flights.violated) / (1.0 + m)
-        # A crash ends the episode with nothing, whether it violated a limit or not.
-        penalised[rewards <= 0.0] = 0.0
-        return observations, penalised.astype(np.float32), dones, infos
+        paid = np.where(self.flights.crashed, self._ever, self.flights.violated)
+        return observations, ((rewards - m * paid) / (1.0 + m)).astype(np.float32), dones, infos

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -23,57 +22,10 @@ from .lagrangian import LagrangianEnv, Multiplier
 from .learner import RowBuffer, Tanh
 from .networks import Features, Network, default_features
 from .policy_gradient import Progress
+from .sb3_options import PpoLagrangianOptions, PpoOptions, SacOptions
 from .vec_env import TaskOptions, TrainingVecEnv
 
 _NEVER = 2**31  # updates between logs of stable-baselines3; runs keep their own
-
-
-@dataclass(frozen=True, slots=True)
-class PpoOptions:
-    """Hyperparameters of PPO."""
-
-    rows: int = 512  # flights, or vehicles of all teams
-    horizon: int = 32  # steps of each row in an update
-    batch: int = 4096
-    epochs: int = 5
-    learning_rate: float = 1e-3
-    final_rate: float = 0.05  # share of the learning rate at the end of the budget
-    discount: float = 0.99
-    trace: float = 0.98  # lambda of the advantage estimate
-    clip: float = 0.2  # of the ratio of probabilities
-    log_std: float = -2.0  # at the start
-    entropy: float = 0.0  # weight of the entropy bonus
-    gradient_norm: float = 0.5  # to which gradients are clipped
-    hidden: tuple[int, ...] = (64, 64)
-    stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for the usual ones
-    critic_updates: int = 5  # of the critic alone, where training goes on from a policy
-
-
-@dataclass(frozen=True, slots=True)
-class PpoLagrangianOptions(PpoOptions):
-    """Hyperparameters of PPO with a bound on the share of violating steps."""
-
-    limit: float = 0.01  # of the share of violating steps in training
-    proportional: float = 0.5  # multiplier per relative excess, which counts up to 1
-    integral: float = 0.02  # the same, per update
-
-
-@dataclass(frozen=True, slots=True)
-class SacOptions:
-    """Hyperparameters of SAC."""
-
-    rows: int = 64
-    gradient_steps: int = 8  # for each step of all rows
-    batch: int = 512
-    memory: int = 500_000  # steps in the replay buffer
-    warm_up: int = 5_000  # steps of random actions
-    learning_rate: float = 1e-3
-    final_rate: float = 0.1  # share of the learning rate at the end of the budget
-    discount: float = 0.98
-    smoothing: float = 0.01  # of the target critics
-    hidden: tuple[int, ...] = (64, 64)
-    stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for the usual ones
-    horizon: int = 64  # steps of each row between two reports
 
 
 def train_ppo(
@@ -125,7 +77,7 @@ def train_ppo_lagrangian(
             "tilt_limit, velocity_limit, position_limit or rate_limit"
         )
     multiplier = Multiplier(options.limit, options.proportional, options.integral)
-    model = make_ppo(LagrangianEnv(flights, multiplier), options, seed, spent)
+    model = make_ppo(LagrangianEnv(flights, multiplier, options.discount), options, seed, spent)
     yield from _updates(model, flights, options, spent, start, multiplier)
 
 
@@ -155,9 +107,19 @@ def train_sac(
 def make_flights(
     task_options: TaskOptions, options: PpoOptions | SacOptions, seed: int, start: Network | None = None
 ) -> TrainingVecEnv:
-    """Flights to train on: as many teams as make about `rows` vehicles, or `rows` single ones."""
+    """Flights to train on: as many teams as make about `rows` vehicles, or `rows` single ones.
+
+    Raises:
+        ValueError: If the preview has not the stages that the network shall see, or actions of the task are
+            no rotor commands.
+    """
     size = task_options.vehicles if isinstance(task_options, TeamOptions) else 1
-    features = default_features(task_options.make_task().layout, options.stages)
+    layout = task_options.make_task().layout
+    if options.stages is not None and not set(options.stages) <= set(range(layout.preview + 1)):
+        raise ValueError(
+            f"hyperparameter stages: the preview has stages 0 to {layout.preview}, got {options.stages!r}"
+        )
+    features = default_features(layout, options.stages)
     if start is not None:
         features = start.features
     return TrainingVecEnv(task_options, max(1, options.rows // size), seed, features=features)
@@ -296,7 +258,7 @@ def _updates(
         if _unsound(model) is not None:
             raise _lost(model, update)
         tally = flights.tally()
-        if multiplier is not None:
+        if multiplier is not None and isinstance(options, PpoLagrangianOptions) and spent() >= options.free:
             multiplier.update(tally.violation_share)
         yield Progress(update, model.num_timesteps, tally.reward), export(model, flights.features)
 

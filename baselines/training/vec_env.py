@@ -93,7 +93,8 @@ class TrainingVecEnv(VecEnv):
         self._n, self._staggered = n, staggered
         self._cut = np.zeros(n, dtype=np.int64)
         self._infos = [_NOTHING] * rows
-        self.costs, self.violated = np.zeros(rows), np.zeros(rows, dtype=np.bool_)  # of the last step
+        self.costs = np.zeros(rows)  # of the last step, as the next two
+        self.violated, self.crashed = np.zeros((2, rows), dtype=np.bool_)
         self._steps, self._reward, self._violations = 0, 0.0, 0
         super().__init__(
             rows,
@@ -130,7 +131,8 @@ class TrainingVecEnv(VecEnv):
             self._begin(group)
         steps = self.task.episode_steps
         self._cut[:] = self._stagger.integers(1, steps + 1, self._n) if self._staggered else 0  # never
-        self.costs, self.violated = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=np.bool_)
+        self.costs = np.zeros(self.num_envs)
+        self.violated, self.crashed = np.zeros((2, self.num_envs), dtype=np.bool_)
         return self._scaled(self._out)
 
     def step_async(self, actions: Floats) -> None:
@@ -151,16 +153,19 @@ class TrainingVecEnv(VecEnv):
         self._steps += 1
         self._reward += float(rewards.sum())
         self._violations += int(np.count_nonzero(self.violated))
-        crashed = rows[:, CRASHED] > 0.0
+        self.crashed = rows[:, CRASHED] > 0.0
         self._cut -= 1
-        ended = (crashed | (rows[:, TRUNCATED] > 0.0)).reshape(self._n, self._size).all(axis=1)
+        ended = (self.crashed | (rows[:, TRUNCATED] > 0.0)).reshape(self._n, self._size).all(axis=1)
         ended |= self._cut == 0
         if not ended.any():
             return self._scaled(self._out), rewards, np.zeros(self.num_envs, dtype=np.bool_), self._infos[:]
         dones, infos = np.repeat(ended, self._size), self._infos[:]
         last = self._scaled(self._out[dones])
         for row, features in zip(np.flatnonzero(dones).tolist(), last, strict=True):
-            infos[row] = {"terminal_observation": features, "TimeLimit.truncated": not bool(crashed[row])}
+            infos[row] = {
+                "terminal_observation": features,
+                "TimeLimit.truncated": not bool(self.crashed[row]),
+            }
         for group in np.flatnonzero(ended).tolist():
             self._begin(group)
         return self._scaled(self._out), rewards, dones, infos

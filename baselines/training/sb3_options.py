@@ -1,0 +1,85 @@
+"""Hyperparameters of what trains with stable-baselines3."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+_POSITIVE = (
+    *("rows", "horizon", "batch", "epochs", "learning_rate", "final_rate", "discount", "clip"),
+    *("gradient_norm", "gradient_steps", "memory", "smoothing"),
+)
+_SHARES = ("free", "final_rate", "discount", "trace", "smoothing")
+
+
+@dataclass(frozen=True, slots=True)
+class PpoOptions:
+    """Hyperparameters of PPO."""
+
+    rows: int = 512  # flights, or vehicles of all teams
+    horizon: int = 32  # steps of each row in an update
+    batch: int = 4096
+    epochs: int = 5
+    learning_rate: float = 1e-3
+    final_rate: float = 0.05  # share of the learning rate at the end of the budget
+    discount: float = 0.99
+    trace: float = 0.98  # lambda of the advantage estimate
+    clip: float = 0.2  # of the ratio of probabilities
+    log_std: float = -2.0  # at the start
+    entropy: float = 0.0  # weight of the entropy bonus
+    gradient_norm: float = 0.5  # to which gradients are clipped
+    hidden: tuple[int, ...] = (64, 64)
+    stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for the usual ones
+    critic_updates: int = 5  # of the critic alone, where training goes on from a policy
+
+    def __post_init__(self) -> None:
+        _check_numbers(self)
+
+
+@dataclass(frozen=True, slots=True)
+class PpoLagrangianOptions(PpoOptions):
+    """Hyperparameters of PPO with a bound on the share of violating steps."""
+
+    limit: float = 0.01  # of the share of violating steps in training
+    free: float = 0.5  # share of the budget before the multiplier moves: first fly, then keep limits
+    proportional: float = 0.2  # multiplier per relative excess, which counts up to 1
+    integral: float = 0.02  # the same, per update
+
+
+@dataclass(frozen=True, slots=True)
+class SacOptions:
+    """Hyperparameters of SAC."""
+
+    rows: int = 64
+    gradient_steps: int = 8  # for each step of all rows
+    batch: int = 512
+    memory: int = 500_000  # steps in the replay buffer
+    warm_up: int = 5_000  # steps of random actions
+    learning_rate: float = 1e-3
+    final_rate: float = 0.1  # share of the learning rate at the end of the budget
+    discount: float = 0.98
+    smoothing: float = 0.01  # of the target critics
+    hidden: tuple[int, ...] = (64, 64)
+    stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for the usual ones
+    horizon: int = 64  # steps of each row between two reports
+
+    def __post_init__(self) -> None:
+        _check_numbers(self)
+
+
+def _check_numbers(options: PpoOptions | SacOptions) -> None:
+    """Refuse hyperparameters that make no sense.
+
+    Raises:
+        ValueError: If there is one; the message names it.
+    """
+    for name in {field.name for field in fields(options)} & {*_POSITIVE, *_SHARES}:
+        value = getattr(options, name)
+        if not 0.0 <= value < math.inf or (name in _POSITIVE and value == 0.0):
+            raise ValueError(f"hyperparameter {name} must be finite and positive, got {value!r}")
+        if name in _SHARES and value > 1.0:
+            raise ValueError(f"hyperparameter {name} must be at most 1, got {value!r}")
+    if not options.hidden or min(options.hidden) < 1:
+        raise ValueError(
+            f"hyperparameter hidden needs at least one layer, of widths >= 1: {options.hidden!r}"
+        )
