@@ -1,9 +1,9 @@
 """Analytic policy gradient: the reward's gradient by backpropagation through the compiled dynamics.
 
-Model-based: it knows the equations of motion and the reward. Windows of `horizon` steps of many flights are
-rolled out and taken back; flights go on from window to window. The objective is
+Model-based: it knows the equations of motion and the reward. Windows of some steps of many flights are rolled
+out and taken back; flights go on from window to window. The objective is
 sum_t gamma^t (log(r_t + eps) - w c_t) with the violation cost c: the gradient of the bounded reward itself
-vanishes where a flight is far off, and where a violation exceeds its scale. Evaluation is always on the reward.
+vanishes where a flight is far off and where a violation exceeds its scale. Evaluation is on the reward alone.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ class PolicyGradientOptions:
     """Hyperparameters of the analytic policy gradient."""
 
     flights: int = 64
-    horizon: int = 25  # steps of a window
+    horizon: int = 25  # steps of a window at the beginning
+    final_horizon: int = 25  # and at the end; long windows see more of what follows, but learn late
     substeps: int = 2  # of the integrator while training; 5 in evaluation
     learning_rate: float = 1e-2
     final_rate: float = 0.03  # share of the learning rate at the end of the budget
@@ -91,12 +92,12 @@ class Actor:
 
 
 def _window_gradient(
-    actor: Actor, flights: DifferentiableFlights, options: PolicyGradientOptions, epsilon: float
+    actor: Actor, flights: DifferentiableFlights, options: PolicyGradientOptions, horizon: int, epsilon: float
 ) -> float:
     """Roll a window out, take it back, leave the gradient in the actor's parameters; the mean reward."""
     task, gain = flights.task, flights.task.hover_force / (flights.task.force_max - flights.task.hover_force)
     seen, outputs, records = [], [], []
-    for _ in range(options.horizon):
+    for _ in range(horizon):
         x = torch.from_numpy(flights.observe()).requires_grad_()
         out = actor(x)
         seen.append(x)
@@ -104,9 +105,9 @@ def _window_gradient(
         records.append(flights.advance(hover_actions(out.detach().numpy(), task)))
     n = flights.n
     plants, commands = np.zeros((n, 16)), np.zeros((n, 4))
-    for t in range(options.horizon - 1, -1, -1):
+    for t in range(horizon - 1, -1, -1):
         record, x, out = records[t], seen[t], outputs[t]
-        weight = -(options.discount**t) / (n * options.horizon)
+        weight = -(options.discount**t) / (n * horizon)
         rewards = np.where(record.crashed, 0.0, weight / (record.rewards + epsilon))
         actions, plants, commands = flights.advance_vjp(
             record, plants, commands, rewards, -weight * options.penalty
@@ -146,17 +147,18 @@ def train(
     if start is not None:
         actor.load(start)
     optimizer = torch.optim.Adam(actor.parameters, lr=options.learning_rate)
-    update = 0
+    update, steps = 0, 0
     while (share := spent()) < 1.0:
         for group in optimizer.param_groups:
             group["lr"] = options.learning_rate * (1.0 - (1.0 - options.final_rate) * share)
         optimizer.zero_grad()
         epsilon = options.epsilon * (options.final_epsilon / options.epsilon) ** share
-        reward = _window_gradient(actor, flights, options, epsilon)
+        horizon = round(options.horizon + share * (options.final_horizon - options.horizon))
+        reward = _window_gradient(actor, flights, options, horizon, epsilon)
         norm = float(torch.nn.utils.clip_grad_norm_(actor.parameters, options.gradient_norm))
         if not np.isfinite(norm):
             raise TrainingError(f"the gradient is {norm} at update {update}: the last good policy is kept")
         optimizer.step()
         update += 1
-        steps = update * options.flights * options.horizon
+        steps += options.flights * horizon
         yield Progress(update, steps, reward), Network(flights.features, *actor.arrays())
