@@ -154,7 +154,8 @@ class DifferentiableFlights:
         flew_on = ~record.done[:, None]
         plants, commands, previous = np.empty((self.n, 16)), np.empty((self.n, 4)), np.empty((self.n, 4))
         tracking_vjp_rows(
-            *record[:8], self._vector, bar_after * flew_on, bar_rewards, np.float64(bar_cost), plants, commands, previous,
+            *record[:8], self._vector, bar_after * flew_on, bar_rewards, np.float64(bar_cost),
+            plants, commands, previous,
             self._scratch,
         )  # fmt: skip
         return (commands + bar_commands * flew_on) * record.slopes, plants, previous
