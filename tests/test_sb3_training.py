@@ -139,6 +139,18 @@ def test_staggered_flights_do_not_end_together():
     assert sum(ends) > 5
 
 
+def test_short_episodes_in_training_are_truncations():
+    env = TrainingVecEnv(TrackingOptions.from_kwargs({}), 2, 0, staggered=False, episode_steps=7)
+    env.reset()
+    ends = []
+    for k in range(1, 22):
+        _, _, dones, infos = env.step(np.zeros((2, 4), dtype=np.float32))
+        if dones.any():
+            ends.append(k)
+            assert all(info["TimeLimit.truncated"] for info in infos)
+    assert ends == [7, 14, 21]
+
+
 def test_infos_of_rows_where_nothing_ended_cannot_be_written():
     env = TrainingVecEnv(TrackingOptions.from_kwargs({}), 2, 0, staggered=False)
     env.reset()

@@ -122,7 +122,8 @@ def make_flights(
     features = default_features(layout, options.stages)
     if start is not None:
         features = start.features
-    return TrainingVecEnv(task_options, max(1, options.rows // size), seed, features=features)
+    n = max(1, options.rows // size)
+    return TrainingVecEnv(task_options, n, seed, features=features, episode_steps=options.episode_steps)
 
 
 def make_ppo(env: VecEnv, options: PpoOptions, seed: int, spent: Callable[[], float]) -> PPO:

@@ -30,6 +30,7 @@ class PpoOptions:
     gradient_norm: float = 0.5  # to which gradients are clipped
     hidden: tuple[int, ...] = (64, 64)
     stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for the usual ones
+    episode_steps: int | None = None  # of a flight in training; None for the task's own
     critic_updates: int = 5  # of the critic alone, where training goes on from a policy
 
     def __post_init__(self) -> None:
@@ -51,8 +52,8 @@ class SacOptions:
     """Hyperparameters of SAC."""
 
     rows: int = 64
-    gradient_steps: int = 8  # for each step of all rows
-    batch: int = 512
+    gradient_steps: int = 4  # for each step of all rows
+    batch: int = 256
     memory: int = 500_000  # steps in the replay buffer
     warm_up: int = 5_000  # steps of random actions
     learning_rate: float = 1e-3
@@ -61,6 +62,7 @@ class SacOptions:
     smoothing: float = 0.01  # of the target critics
     hidden: tuple[int, ...] = (64, 64)
     stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for the usual ones
+    episode_steps: int | None = None  # of a flight in training; None for the task's own
     horizon: int = 64  # steps of each row between two reports
 
     def __post_init__(self) -> None:
@@ -79,6 +81,8 @@ def _check_numbers(options: PpoOptions | SacOptions) -> None:
             raise ValueError(f"hyperparameter {name} must be finite and positive, got {value!r}")
         if name in _SHARES and value > 1.0:
             raise ValueError(f"hyperparameter {name} must be at most 1, got {value!r}")
+    if options.episode_steps is not None and options.episode_steps < 1:
+        raise ValueError(f"hyperparameter episode_steps must be >= 1, got {options.episode_steps!r}")
     if not options.hidden or min(options.hidden) < 1:
         raise ValueError(
             f"hyperparameter hidden needs at least one layer, of widths >= 1: {options.hidden!r}"

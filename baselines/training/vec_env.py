@@ -54,6 +54,7 @@ class TrainingVecEnv(VecEnv):
         features: What the network sees; None for all that `default_features` keeps.
         staggered: Whether the first episodes are cut at random, so that flights are at all times of the
             episode from then on. A cut counts as a truncation.
+        episode_steps: After which an episode is cut, if the task's is longer: short ones see more starts.
 
     Raises:
         ValueError: If n < 1, or actions of the task are no rotor commands.
@@ -69,6 +70,7 @@ class TrainingVecEnv(VecEnv):
         *,
         features: Features | None = None,
         staggered: bool = True,
+        episode_steps: int | None = None,
     ) -> None:
         if n < 1:
             raise ValueError(f"the number of flights or teams must be >= 1, got {n!r}")
@@ -91,7 +93,8 @@ class TrainingVecEnv(VecEnv):
         self._out = np.empty((rows, self.task.layout.size), dtype=np.float32)
         self._actions = np.zeros((rows, self.action_size), dtype=np.float32)
         self._n, self._staggered = n, staggered
-        self._cut = np.zeros(n, dtype=np.int64)
+        self._steps_of_episode = min(episode_steps or self.task.episode_steps, self.task.episode_steps)
+        self._left = np.zeros(n, dtype=np.int64)  # steps of each episode until it is cut
         self._infos = [_NOTHING] * rows
         self.costs = np.zeros(rows)  # of the last step, as the next two
         self.violated, self.crashed = np.zeros((2, rows), dtype=np.bool_)
@@ -129,8 +132,8 @@ class TrainingVecEnv(VecEnv):
         """Begin all episodes."""
         for group in range(self._n):
             self._begin(group)
-        steps = self.task.episode_steps
-        self._cut[:] = self._stagger.integers(1, steps + 1, self._n) if self._staggered else 0  # never
+        if self._staggered:
+            self._left[:] = self._stagger.integers(1, self._steps_of_episode + 1, self._n)
         self.costs = np.zeros(self.num_envs)
         self.violated, self.crashed = np.zeros((2, self.num_envs), dtype=np.bool_)
         return self._scaled(self._out)
@@ -154,9 +157,9 @@ class TrainingVecEnv(VecEnv):
         self._reward += float(rewards.sum())
         self._violations += int(np.count_nonzero(self.violated))
         self.crashed = rows[:, CRASHED] > 0.0
-        self._cut -= 1
+        self._left -= 1
         ended = (self.crashed | (rows[:, TRUNCATED] > 0.0)).reshape(self._n, self._size).all(axis=1)
-        ended |= self._cut == 0
+        ended |= self._left == 0
         if not ended.any():
             return self._scaled(self._out), rewards, np.zeros(self.num_envs, dtype=np.bool_), self._infos[:]
         dones, infos = np.repeat(ended, self._size), self._infos[:]
@@ -179,6 +182,7 @@ class TrainingVecEnv(VecEnv):
 
     def _begin(self, group: int) -> None:
         """A new episode of one flight or team."""
+        self._left[group] = self._steps_of_episode
         if isinstance(self._batch, TeamBatch):
             mine = self._out[group * self._size : (group + 1) * self._size]
             self._batch.reset_team(group, self._generators[group], mine)
