@@ -8,8 +8,9 @@ minimises the sum of their costs (5.5) within box and rate of the rotors and, so
     a_ijN'(p_i(k+N) + t_b v_i(k+N) - p_j(k+N) - t_b v_j(k+N)) >= d_s     likewise, v = R_BI(Theta_k)'V_B
 
 The normals a_ijn follow the previous plan, so that a pair that has begun to pass keeps its sides. OSQP solves
-it: the rows of a pair are sparse, any number of vehicles will do, and work space and warm start persist. The
-matrices are filled as dense ones: meant for teams of up to some ten vehicles.
+it, set up anew and started cold at each sample: nothing is kept outside the memory, so that a flight can be
+repeated, and that costs no more time than updating. The matrices are filled as dense ones, which limits the
+team: their size grows with the fourth power of the number of vehicles.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ _SOLVED = 1
 _NO_BOUND = 1e30  # OSQP's infinity
 _SLACK_SCALE = 1e-2  # m per unit of a slack variable: unscaled, OSQP needs many times the iterations
 _COINCIDENT = 1e-9  # m
+_MOST_VEHICLES = 15  # its dense rows take 20 MB; 0.2 GB with 30 vehicles, 17 GB with 100
 
 
 class _Sample(NamedTuple):
@@ -84,7 +86,7 @@ class CentralMpc:
         max_iter: OSQP's iteration limit.
 
     Raises:
-        ValueError: If an option is not allowed.
+        ValueError: If an option is not allowed, or the team has more than 15 vehicles.
     """
 
     def __init__(
@@ -101,6 +103,11 @@ class CentralMpc:
         eps: float = 1e-6,
         max_iter: int = 20000,
     ) -> None:
+        if task.vehicles > _MOST_VEHICLES:
+            raise ValueError(
+                f"a central MPC takes at most {_MOST_VEHICLES} vehicles, got {task.vehicles}: it fills dense "
+                "matrices, whose size grows with the fourth power of that number; use a distributed MPC"
+            )
         if horizon != int(horizon) or horizon < 1:
             raise ValueError(f"horizon must be a whole number of samples >= 1, got {horizon!r}")
         if not 0.0 <= alpha <= 1.0:
@@ -132,7 +139,6 @@ class CentralMpc:
         self._mask = self._pattern(n, N_INPUT * N, K)
         self.memory_size = 1 + n * N * (N_INPUT + 3)
         self._settings = {"eps_abs": eps, "eps_rel": eps, "max_iter": max_iter, "polishing": True}
-        self._solver: Any = None
 
     def decide(
         self,
@@ -319,30 +325,21 @@ class CentralMpc:
         if not all(np.isfinite(part).all() for part in (sample.H, sample.g, sample.A)):
             return None, 0
         size = self.task.vehicles * N_INPUT * self.horizon
-        upper_triangle = np.triu(
-            np.kron(np.eye(self.task.vehicles), np.ones((size // self.task.vehicles,) * 2))
-        )
+        vehicles = self.task.vehicles
         triangle = np.zeros(sample.H.shape, dtype=bool)
-        triangle[:size, :size] = upper_triangle > 0.0
-        P_values, A_values = sample.H.T[triangle.T], sample.A.T[self._mask.T]
+        triangle[:size, :size] = np.triu(np.kron(np.eye(vehicles), np.ones((size // vehicles,) * 2))) > 0.0
+        P = _csc(triangle, sample.H.T[triangle.T])
+        A = _csc(self._mask, sample.A.T[self._mask.T])
         lower, upper = np.maximum(sample.lower, -_NO_BOUND), np.minimum(sample.upper, _NO_BOUND)
-        if self._solver is None:
-            self._solver = osqp.OSQP()
-            P, A = _csc(triangle, P_values), _csc(self._mask, A_values)
-            self._solver.setup(P, sample.g, A, lower, upper, verbose=False, **self._settings)
-        else:
-            self._solver.update(Px=P_values, Ax=A_values, q=sample.g, l=lower, u=upper)
-        result = self._solver.solve(raise_error=False)
+        solver = osqp.OSQP()
+        solver.setup(P, sample.g, A, lower, upper, verbose=False, **self._settings)
+        result = solver.solve(raise_error=False)
         iterations = int(result.info.iter)
         # After any other status x holds large finite numbers: only the status tells.
         if int(result.info.status_val) != _SOLVED:
             return None, iterations
         z = np.asarray(result.x, dtype=np.float64)
         return (z[:size], iterations) if np.isfinite(z).all() else (None, iterations)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Everything but the OSQP object, which does not pickle and is made again when needed."""
-        return {**self.__dict__, "_solver": None}
 
 
 def _csc(mask: NDArray[np.bool_], values: Array) -> Any:
