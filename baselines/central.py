@@ -38,7 +38,7 @@ class CentralMpcPolicy:
         max_iter: See there.
 
     Raises:
-        ValueError: If an option is not allowed, the team has more than 15 vehicles, or the task does not say its slots.
+        ValueError: If an option is not allowed, the task does not say its slots, or there are over 15 vehicles.
     """
 
     privileged = True

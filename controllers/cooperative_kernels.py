@@ -84,8 +84,8 @@ def pose_row(
     data: MpcData,
     s: Scratch,
     work: Array,
-) -> tuple[int, int, int]:
-    """The problem of vehicle j into s; how many normals and rows count; how many vehicles coincide."""
+) -> tuple[int, int]:
+    """The problem of vehicle j into s; how many normals and rows count."""
     N = s.c.shape[0]
     plant, memory = team[_PLANT][j], team[_MEMORY][j]
     window = work[: N_REFERENCE * (N + 1)].reshape(N + 1, N_REFERENCE)
@@ -114,12 +114,11 @@ def pose_row(
     plan = memory[memory.shape[0] - N_PLAN_STAGE * N :]
     v, other, rest = free[:3], free[3:9], free[9:]
     v[0], v[1], v[2] = inertial_velocity(plant)
-    used, coincident = separation_rows(
+    used = separation_rows(
         plant, v, comm, sensed, plan if memory[0] > 0.0 else plan[:0], N, avoidance,
         s.normals[layout.limits :], s.row_lower[layout.limit_rows :], other, rest,
     )  # fmt: skip
-    H, K = layout.limits + layout.slot_normals * used, layout.limit_rows + layout.slot_rows * used
-    return H, K, coincident
+    return layout.limits + layout.slot_normals * used, layout.limit_rows + layout.slot_rows * used
 
 
 @kernel
@@ -168,7 +167,7 @@ def decide_team(
     N = ws.u.shape[0]
     s = carve(buffer, N, layout.pairs, data.normals.shape[0], data.normal.shape[0], 0)
     for j in range(commands.shape[0]):
-        H, K, coincident = pose_row(team, j, which, consensus, avoidance, layout, data, s, work)
+        H, K = pose_row(team, j, which, consensus, avoidance, layout, data, s, work)
         plant, memory = team[_PLANT][j], team[_MEMORY][j]
         level, iterations = solve_row(s.A, s.B, data.Q, s.P, False, s.r, memory[0] > 0.0, H, K, data, s, ws)
         end_row(
@@ -176,5 +175,5 @@ def decide_team(
         )
         start = kept.shape[1] - N_PLAN_STAGE * N
         _write_plan(level, plant, ws.x, memory[start:], data.dt, kept[j, start:])
-        report[0, j], report[1, j], report[2, j] = level, iterations, coincident
+        report[0, j], report[1, j] = level, iterations
     return bad

@@ -44,7 +44,6 @@ class CooperativeDecision(NamedTuple):
     fallback: IntArray  # (n,), Fallback: how each command was found
     iterations: IntArray  # (n,), active-set iterations
     plan: Array  # (n, N, 6), p and v predicted for k+1..k+N, inertial, p relative to the present position
-    coincident: IntArray  # (n,), vehicles at the same place, from which no row can keep away
 
 
 class CooperativeMpc:
@@ -76,7 +75,7 @@ class CooperativeMpc:
         moving_centre: Whether the common centre of a pair moves with it.
         braking_time: t_b, s; 0 for no braking row.
         swirl: Turn of the normals about the vertical, rad.
-        separation_weight: Exact penalty per metre of a separation row.
+        separation_weight: Penalty per metre of a separation row; `collision.py` says why not more.
         soft_weight: Exact penalty per unit of the other state rows; inf makes them hard.
         margin: What the plan keeps from each limit of the task, in its SI unit.
         reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
@@ -106,7 +105,7 @@ class CooperativeMpc:
         moving_centre: bool = True,
         braking_time: float = 0.25,
         swirl: float = math.radians(5.0),
-        separation_weight: float = 1e4,
+        separation_weight: float = 1e3,
         soft_weight: float = 1e3,
         margin: float = 0.02,
         reject_disturbance: bool = False,
@@ -130,6 +129,7 @@ class CooperativeMpc:
             iteration_limit,
         )  # fmt: skip
         require_messages(task.layout.comm_size, self.consensus)
+        self.avoidance.require_plans(task.layout.plan)
         self._prepare(float(alpha), terminal_weight == "stage")
         estimator = ESTIMATOR_SIZE if reject_disturbance else 0
         self.memory_size = 1 + (N_INPUT + N_PLAN_STAGE) * self.horizon + estimator
@@ -202,7 +202,7 @@ class CooperativeMpc:
         team = self._as_team(arguments)
         n, N = len(team[0]), self.horizon
         command, kept = np.empty((n, N_INPUT)), np.empty((n, self.memory_size))
-        report = np.empty((3, n), np.int64)
+        report = np.empty((2, n), np.int64)
         which, *scratch = self._scratch()
         bad = decide_team(team, command, kept, report, which, *self._constants, *scratch)
         if bad >= 0:
@@ -212,7 +212,7 @@ class CooperativeMpc:
             )
             raise ValueError(f"{NAMES[argument]} of vehicle {row} is not finite; {remedy}")
         plan = kept[:, -N_PLAN_STAGE * N :].reshape(n, N, N_PLAN_STAGE).copy()
-        return CooperativeDecision(command, kept, report[0], report[1], plan, report[2])
+        return CooperativeDecision(command, kept, report[0], report[1], plan)
 
     def problems(self, *arguments: ArrayLike | None) -> list[OcpQp]:
         """The OCP-QP of each vehicle, in its heading frame; arguments as of `decide`. For study and tests."""
@@ -221,7 +221,7 @@ class CooperativeMpc:
         data, layout = self._data, self._layout
         s = carve(buffer, self.horizon, layout.pairs, len(data.normals), len(data.normal), 0)
         for j in range(len(team[0])):
-            H, K, _ = pose_row(team, j, which, *self._constants, s, work)
+            H, K = pose_row(team, j, which, *self._constants, s, work)
             rows = StateRows(
                 s.normals[:H].copy(),
                 data.normal[:K],

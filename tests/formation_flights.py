@@ -152,7 +152,6 @@ def fly_team(controller, start, slots, G, path, seconds=20.0):
 class Meeting(NamedTuple):
     gap: float  # m, smallest distance
     end: float  # m, largest distance from the goals, 3 s after the end of the references
-    coincident: int
 
 
 def swap_antipodes(controller, speed, vehicles=2, seed=0, jitter=0.05):
@@ -165,7 +164,7 @@ def swap_antipodes(controller, speed, vehicles=2, seed=0, jitter=0.05):
     plants, last = at_rest(start, task), np.full((vehicles, 4), task.hover_force)
     memory, zero = np.zeros((vehicles, controller.memory_size)), np.zeros((vehicles, 6))
     comm = np.zeros((vehicles, task.layout.neighbours, task.layout.comm_size))
-    stages, gap, coincident, plans = task.layout.preview + 1, np.inf, 0, None
+    stages, gap, plans = task.layout.preview + 1, np.inf, None
     G = np.ones((vehicles, vehicles))
     for k in range(round((length.max() / speed + 3.0) / DT)):
         preview = np.zeros((vehicles, stages, 8))
@@ -186,8 +185,8 @@ def swap_antipodes(controller, speed, vehicles=2, seed=0, jitter=0.05):
         last, memory = decision.command, decision.memory
         plans = decision.plan + np.pad(plants[:, None, :3], ((0, 0), (0, 0), (0, 3)))
         plants = simulate(plants, last, task.params)
-        gap, coincident = min(gap, smallest_gap(plants)), coincident + int(decision.coincident.sum())
-    return Meeting(gap, np.linalg.norm(plants[:, :3] - goal, axis=1).max(), coincident)
+        gap = min(gap, smallest_gap(plants))
+    return Meeting(gap, np.linalg.norm(plants[:, :3] - goal, axis=1).max())
 
 
 def decide(controller, plants, G, slots, memory=None, path=still, target=(None,) * 4, **changed):

@@ -31,7 +31,7 @@ class Rows:
         layout = options.layout(slots, N)
         self.normals, self.lower = np.zeros_like(layout.normals), layout.lower.copy()
         arguments = np.ascontiguousarray(comm), np.ascontiguousarray(sensed), own, N
-        self.used, self.coincident = separation_rows(
+        self.used = separation_rows(
             plant, v, *arguments, options.data(D_S, R_S, DT), self.normals, self.lower, np.zeros(6),
             np.zeros(COLLISION_SCRATCH),
         )  # fmt: skip
@@ -138,13 +138,13 @@ def test_edges_give_rows_for_those_it_hears_within_the_radius():
     np.testing.assert_allclose(late.lower[:12], heard.lower[:12], atol=1e-12)
 
 
-def test_vehicles_at_one_place_are_skipped_and_counted():
+def test_vehicles_at_one_place_are_skipped():
     task, plants = some_team(np.random.default_rng(5), 3)
     plants[1, :3] = plants[0, :3] + 1e-10
     v, sensed = velocities(plants), sensed_rows(plants, task)
     for rule in ("reciprocal", "frozen", "plan"):
         rows = Rows(AvoidanceOptions(rule), plants[0], v[0], sensed=sensed[0])
-        assert (rows.used, rows.coincident) == (1, 1)
+        assert rows.used == 1
         assert np.isfinite(rows.normals).all()
 
 
@@ -152,7 +152,7 @@ def test_nobody_and_no_rule_make_no_rows():
     _, plants = some_team(np.random.default_rng(6), 2)
     assert Rows(AvoidanceOptions(), plants[0], np.zeros(3)).used == 0
     empty = Rows(AvoidanceOptions(), plants[0], np.zeros(3), sensed=np.zeros((4, 7)))
-    assert (empty.used, empty.coincident) == (0, 0)
+    assert empty.used == 0
     assert len(AvoidanceOptions("none").layout(4, N).normal) == 0
 
 
