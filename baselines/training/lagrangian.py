@@ -1,10 +1,11 @@
 """A bound on the share of violating steps as a Lagrange multiplier on the reward.
 
-Maximise E[sum r_t] such that the share of violating steps is at most `limit`. Steps that a crash takes away
-count as violating, for ever, so that however large the multiplier m gets, crashing early never pays:
+Maximise E[sum r_t] such that the share of violating steps is at most `limit`:
 
-    (r - m c) / (1 + m),   c = 1 in a violating step, else 0,
-    -m / ((1 + m) (1 - gamma))   in the step of a crash.
+    (r - m c) / (1 + m),   c = 1 in a violating step or a crash, else 0,   m >= 0 the multiplier.
+
+Near the limit c is rare, so that the mean stays positive and crashing early does not pay. To charge a crash
+for all the steps that it takes away was worse: a few huge costs spoil the critic, and the policy with it.
 """
 
 from __future__ import annotations
@@ -56,14 +57,11 @@ class LagrangianEnv(VecEnvWrapper):
     Args:
         venv: The flights.
         multiplier: Read at every step.
-        discount: Of the learner, < 1.
     """
 
-    def __init__(self, venv: TrainingVecEnv, multiplier: Multiplier, discount: float) -> None:
+    def __init__(self, venv: TrainingVecEnv, multiplier: Multiplier) -> None:
         super().__init__(venv)
-        if not discount < 1.0:
-            raise ValueError(f"a multiplier on the cost needs a discount below 1, got {discount!r}")
-        self.flights, self.multiplier, self._ever = venv, multiplier, 1.0 / (1.0 - discount)
+        self.flights, self.multiplier = venv, multiplier
 
     def reset(self) -> Floats:
         """Begin all episodes."""
@@ -73,5 +71,5 @@ class LagrangianEnv(VecEnvWrapper):
         """One control period, with penalised rewards."""
         observations, rewards, dones, infos = self.flights.step_wait()
         m = self.multiplier.value
-        paid = np.where(self.flights.crashed, self._ever, self.flights.violated)
-        return observations, ((rewards - m * paid) / (1.0 + m)).astype(np.float32), dones, infos
+        cost = self.flights.violated | self.flights.crashed
+        return observations, ((rewards - m * cost) / (1.0 + m)).astype(np.float32), dones, infos

@@ -77,7 +77,7 @@ def train_ppo_lagrangian(
             "tilt_limit, velocity_limit, position_limit or rate_limit"
         )
     multiplier = Multiplier(options.limit, options.proportional, options.integral)
-    model = make_ppo(LagrangianEnv(flights, multiplier, options.discount), options, seed, spent)
+    model = make_ppo(LagrangianEnv(flights, multiplier), options, seed, spent)
     yield from _updates(model, flights, options, spent, start, multiplier)
 
 
