@@ -38,7 +38,7 @@ class CentralMpcPolicy:
         max_iter: See there.
 
     Raises:
-        ValueError: If an option is not allowed, the task does not say its slots, or there are over 15 vehicles.
+        ValueError: If an option is not allowed, there are over 15 vehicles, or the task has no slots.
     """
 
     privileged = True
