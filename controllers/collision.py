@@ -16,7 +16,7 @@ bounds, and a vehicle in a crowd tumbles within a second.
 Deviation:
     (5.7) as printed has the sign reversed, freezes the neighbour, and covers graph neighbours only, which the
     vehicles that collide mostly are not.
-    The penalty, which the text lacks, is 1e3 per metre. Of six flights of a hundred vehicles two crash with 1e4
+    The penalty, not in the text, is 1e3 per metre. Of six flights of a hundred vehicles two crash with 1e4
     (upside down), with 3e3 and with 2e3; with 1e3 none does, of 14 (32 degrees, 0.386 m at worst), but two of
     eight with a braking time of 0.4 s; with 500 none, at up to 67 degrees. Pairs that meet at 2 m/s each need
     as much: 0.412 m with 1e4, 0.408 m with 1e3, 0.381 m with 500, 0.291 m with 300.
