@@ -119,7 +119,8 @@ def _list_options(options: ListOptions) -> int:
             kind = import_module(TEAMS[options.name]).raw_env.options_type
         else:
             from quad_envs.envs.options import TrackingOptions as kind
-        values = {entry.name: entry.default for entry in fields(kind)} | TRACKING.get(options.name, {})
+        values = {entry.name: entry.default for entry in fields(kind) if entry.init}
+        values |= TRACKING.get(options.name, {})
         del values["env_id"]
         flag = "--set"
     elif options.name in names:

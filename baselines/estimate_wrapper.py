@@ -53,8 +53,9 @@ class EstimateWrapper(BaseParallelWrapper):  # type: ignore[misc]
     """A team with a target whose agents filter, exchange and fuse estimates, and observe them.
 
     Infos gain `nees` (e'P^-1 e of the own estimated position, chi^2 with 3 degrees of freedom), `nis` (of the
-    agent's own measurements of this step, chi^2 with `nis_rows` degrees of freedom; nan without any). The
-    estimates in `env.task.layout` have a name of their own, so that `make_policy(name, env)` reads them.
+    agent's own measurements of this step, chi^2 with `nis_rows` degrees of freedom; nan without any), and
+    `mode`, "EKF,m" with m measurements held. The estimates in `env.task.layout` have a name of their own, so
+    that `make_policy(name, env)` reads them.
 
     Args:
         env: A ParallelEnv of this suite with a target.
@@ -137,6 +138,7 @@ class EstimateWrapper(BaseParallelWrapper):  # type: ignore[misc]
             infos[name]["nees"] = float(consistency[i])
             infos[name]["nis"] = float(done.reports[i, 0])
             infos[name]["nis_rows"] = int(done.reports[i, 1])
+            infos[name]["mode"] = f"EKF,{int(done.reports[i, 2])}"
         return {name: np.concatenate([row, more]) for name, row, more in zip(names, rows, block, strict=True)}
 
     def _exchange(self, agents: NDArray[np.int64], filters: Array, comm: Array) -> _Heard:

@@ -160,11 +160,10 @@ class EstimatorPolicy(TeamPolicy):
     def _decide(self, obs: Actions, state: PolicyState, start: Flags) -> tuple[Actions, PolicyState]:
         done = self.estimator.step(obs, state.memory, start)
         estimates, n = done.estimates, len(obs)
+        if not self._trilaterates:
+            estimates = estimates._replace(trilaterated=None)
         fallbacks = np.where(start[:, None], 0, state.fallbacks)
-        level = np.zeros(n, dtype=np.int64)
-        if self._trilaterates and estimates.trilaterated is not None:
-            level[~estimates.trilaterated] = 1
-        fallbacks[np.arange(n), level] += 1
+        fallbacks[:, 0] += 1  # `estimates.modes` tells how each was found
         count = np.zeros(n, dtype=np.int64)
         kept = PolicyState(done.filters, fallbacks, count, count, estimates)
         return estimate_actions(estimates), kept

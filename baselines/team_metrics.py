@@ -48,7 +48,8 @@ TEAM_SUMMARY = tuple(
 # Columns that are nan after a crash.
 TEAM_CUT_SHORT = (
     *("formation_rms", "formation_rms_worst", "formation_final", "formation_final_worst"),
-    *("formation_settling", "z_error_rms", "estimate_rmse", "estimate_rmse_worst", "estimate_sigma"),
+    *("formation_settling", "z_error_max", "z_error_rms"),
+    *("estimate_rmse", "estimate_rmse_worst", "estimate_sigma"),
 )
 
 
@@ -104,7 +105,7 @@ def _estimates(episode: Episode) -> dict[str, float]:
         found["anees"] = anees(error[given], P[given])
     if updated.any():
         found["nis_ratio"] = float((nis[updated] / rows[updated]).mean())
-    if "trilaterated" in signals and signals["trilaterated"].any():
+    if "trilaterated" in signals:
         found["trilateration_share"] = float(signals["trilaterated"].mean())
     return found
 

@@ -10,6 +10,7 @@ from .observations import TrackingLayout
 from .parameters import Limits, QuadrotorParams, Weights
 
 _Triple = tuple[float, float, float]
+LOSS_PARTS = ("position", "velocity", "attitude", "rates", "effort", "formation")  # of the stage cost
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +76,11 @@ class TeamTask(BaseTask):
     def constraint_names(self) -> tuple[str, ...]:
         """The vehicle's limits, then the distance between vehicles; none where vehicles run on rails."""
         return () if self.mission == "estimation" else (*constraint_names(self.limits), "separation")
+
+    @property
+    def reward_term_names(self) -> tuple[str, ...]:
+        """Names of the entries of `info["reward_terms"]`."""
+        return (*LOSS_PARTS, *self.constraint_names)
 
     @property
     def action_size(self) -> int:

@@ -163,6 +163,30 @@ def test_a_crash_ends_the_episode_of_the_whole_team_and_rewards_nobody():
     assert all(info["crashed"] for info in infos.values())
 
 
+def test_a_crash_says_who_and_why():
+    for terminate in ("team", "agent"):
+        env, (_, _, _, _, infos) = collide(terminate)
+        assert [info["crash_cause"] for info in infos.values()] == ["", "distance", "distance", "", "", ""]
+    env, state = formation_v0.parallel_env(vehicles=2, graph="chain"), np.zeros((2, 12))
+    state[1, 1], state[0, 9] = 5.0, 40.0
+    env.reset(options={"state": state})
+    *_, infos = env.step({name: np.zeros(4, np.float32) for name in env.agents})
+    assert infos["quad_0"]["crash_cause"] == "tilt" and infos["quad_1"]["crash_cause"] == ""
+    assert all(info["crashed"] for info in infos.values()), "the episode of both ended in a crash"
+
+
+def test_the_cost_of_the_crash_counts():
+    for terminate in ("team", "agent"):
+        _, (*_, infos) = collide(terminate)
+        assert infos["quad_1"]["cost"] > 0.0
+        assert infos["quad_1"]["episode_cost"] == infos["quad_1"]["cost"]
+
+
+def test_who_crashes_still_sees_where():
+    _, (seen, *_) = collide("agent")
+    assert abs(np.hypot(*seen["quad_1"][5:7]) - 1.0) < 1e-6, "sine and cosine of the heading"
+
+
 def test_crashed_agents_leave_the_others_fly_on_without_them():
     env, (_, rewards, terminated, _, _) = collide("agent")
     assert [name for name, end in terminated.items() if end] == ["quad_1", "quad_2"]
@@ -173,8 +197,37 @@ def test_crashed_agents_leave_the_others_fly_on_without_them():
     comm = env.task.layout.decode(seen["quad_3"]).comm
     gone = np.isin(env.senders[3], [1, 2])
     assert not comm[gone].any() and (comm[~gone & (env.senders[3] >= 0), 0] > 0.0).all()
+    graph = env.state()[env.state_slices["graph"]].reshape(6, 6)
+    assert not graph[[1, 2]].any() and not graph[:, [1, 2]].any() and graph[3, 3] == 1.0
     with pytest.raises(ValueError, match="quad_1, quad_2 left the episode"):
         env.step({name: np.zeros(4, np.float32) for name in env.possible_agents})
+
+
+def test_who_flies_alone_is_as_far_from_the_others_as_can_be():
+    env = formation_v0.parallel_env(vehicles=3, formation="triangle", terminate="agent")
+    state = np.zeros((3, 12))
+    state[:, 1] = [0.0, 10.0, 10.5]
+    state[1, 4], state[2, 4] = 3.0, -3.0
+    env.reset(seed=0, options={"state": state})
+    for _ in range(2):
+        *_, infos = env.step({name: np.zeros(4, np.float32) for name in env.agents})
+    assert infos["quad_0"]["min_separation"] == 200.0
+
+
+def test_nothing_counts_in_the_rows_of_vehicles_that_left():
+    many, state = formation_v0.vector_env(1, graph="strong", terminate="agent"), np.zeros((6, 12))
+    state[:, 1] = [0.0, 10.0, 10.5, 20.0, 30.0, 40.0]
+    state[1, 4], state[2, 4] = 3.0, -3.0
+    many.reset(seed=0, options={"state": state})
+    actions = np.zeros((6, 4), np.float32)
+    *_, first = many.step(actions)
+    _, rewards, terminated, _, later = many.step(actions)
+    assert first["cost"][1] > 0.0 and terminated.tolist() == [False, True, True, False, False, False]
+    assert later["alive"].tolist() == [True, False, False, True, True, True]
+    for name in ("cost", "stage_cost", "constraint_violation"):
+        assert not later[name][1:3].any()
+    assert not later["reward_terms"][1:3].any() and not rewards[1:3].any()
+    assert later["episode_cost"][1] == first["episode_cost"][1]
 
 
 def test_leaving_the_arena_and_turning_over_are_crashes():
@@ -225,7 +278,24 @@ def test_a_batch_of_teams_equals_single_teams(module, kwargs):
             for given, ours in zip(said, (rewards, terminated, truncated), strict=True):
                 assert ours[rows].tolist() == list(given.values())
             for key in infos[next(iter(infos))]:
-                assert np.array_equal(info[key][rows], column(infos, key), equal_nan=True)
+                numbers = key != "crash_cause"
+                assert np.array_equal(info[key][rows], column(infos, key), equal_nan=numbers)
+
+
+def test_a_masked_reset_begins_only_its_teams_anew():
+    env = formation_v0.vector_env(3, autoreset_mode="Disabled")
+    env.reset(seed=0)
+    seen, *_ = env.step(np.full((18, 4), 0.1, np.float32))
+    again, _ = env.reset(options={"reset_mask": np.array([True, False, False])})
+    assert np.array_equal(again[6:], seen[6:]) and not np.array_equal(again[:6], seen[:6])
+    rows = np.repeat([False, True, False], 6)
+    assert np.array_equal(env.reset(options={"reset_mask": rows})[0][:6], again[:6])
+    with pytest.raises(ValueError, match="alike for all vehicles of a team"):
+        env.reset(options={"reset_mask": np.arange(18) == 0})
+    with pytest.raises(ValueError, match=r"shape \(3,\) or \(18,\)"):
+        env.reset(options={"reset_mask": np.ones(4, dtype=bool)})
+    with pytest.raises(ValueError, match="first reset must begin all"):
+        formation_v0.vector_env(2).reset(options={"reset_mask": np.array([True, False])})
 
 
 def test_a_batch_refuses_what_it_cannot_do():
@@ -290,7 +360,8 @@ def test_the_task_does_not_know_where_it_is():
         (formation_v0, {"start": ((0.0, 0.0, 0.0),) * 6}, "coincide|apart"),
         (formation_v0, {"drop_out": 1.5}, "drop_out must be a number from 0 to 1"),
         (formation_v0, {"delay": -1}, "delay must be an integer >= 0"),
-        (formation_v0, {"delay": 10, "message_lifetime": 0.2}, "message_lifetime must be a number from 0.5"),
+        (formation_v0, {"delay": 10, "message_lifetime": 0.2}, "at least the delay of 10 steps"),
+        (formation_v0, {"message_lifetime": np.inf}, "message_lifetime must be a finite number"),
         (formation_v0, {"crash_distance": 0.5}, "below the separation"),
         (formation_v0, {"comm": "pigeon"}, "comm must be 'state' or 'plan'"),
         (formation_v0, {"terminate": "both"}, "terminate must be 'team' or 'agent'"),
@@ -307,11 +378,14 @@ def test_the_task_does_not_know_where_it_is():
         (cooperative_estimation_v0, {"rails": ((0.0, 0.0, 0.0),) * 4}, "coincide"),
         (cooperative_estimation_v0, {"vehicles": 3, "graph": "ring"}, "rails must be 3 positions"),
         (cooperative_estimation_v0, {"comm": "plan"}, "on rails"),
+        (cooperative_estimation_v0, {"start": "line"}, "start has no effect"),
+        (cooperative_estimation_v0, {"formation": "hexagon"}, "formation has no effect"),
+        (target_tracking_v0, {"sensor_sigma": 0.1}, "three standard deviations"),
     ],
 )
 def test_bad_arguments_are_refused_by_name(module, kwargs, message):
     with pytest.raises(ValueError, match=message):
-        module.parallel_env(**kwargs).reset(seed=0)
+        module.parallel_env(**kwargs)
 
 
 def test_an_unknown_argument_names_the_nearest():
@@ -326,6 +400,11 @@ def test_an_unknown_argument_names_the_nearest():
         (lambda actions: actions.update(quad_9=np.zeros(4)), r"extra \['quad_9'\]"),
         (lambda actions: actions.update(quad_2=np.zeros(3)), "action of quad_2 must be 4 numbers"),
         (lambda actions: actions.update(quad_2="up"), "action of quad_2 must be 4 numbers"),
+        (lambda actions: actions.update(quad_2=np.zeros((1, 4))), "action of quad_2 must be 4 numbers"),
+        (
+            lambda actions: actions.update(quad_2=np.zeros(3), quad_3=np.zeros(5)),
+            "action of quad_2 must be 4 numbers",
+        ),
         (lambda actions: actions.update(quad_2=np.full(4, np.inf)), r"action\[0\] of vehicle 2"),
     ],
 )
@@ -362,11 +441,13 @@ def test_vehicles_may_not_start_in_each_other():
         (formation_v0, {"drop_out": 1.0}),
         (target_tracking_v0, {"graph": "case-2", "measuring": (5,)}),
         (target_tracking_v0, {"measuring": ()}),
+        (target_tracking_v0, {"detection": 0.0}),
     ],
 )
 def test_a_team_that_cannot_be_reached_warns_and_flies(module, kwargs):
-    with pytest.warns(UserWarning, match="no spanning tree|loses every message"):
+    with pytest.warns(UserWarning, match="no spanning tree") as said:
         env = module.parallel_env(**kwargs)
+    assert len(said) == 1
     assert not env.task.spanning_tree
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from controllers.estimation.consistency import covariance_bound, information
 from controllers.estimation.ekf import constant_velocity_model
 from controllers.estimation.fusion import covariance_intersection
-from quad_envs.envs.team_options import CHAPTER_6_TARGET
 from quad_envs.parameters import Array
-from quad_envs.targets import Aircraft
+from quad_envs.targets import Aircraft, make_target
 
 from .scenes import (
     INTERVALS,
@@ -35,7 +34,7 @@ RUNS = 60
 FUSION_RUNS = 40
 Q = 0.02  # m^2/s^3, of the target and of the filters
 SETTLED = slice(40, 200)  # 2 to 10 s
-_START = np.array([*CHAPTER_6_TARGET.position, *CHAPTER_6_TARGET.velocity])
+_START = make_target("chapter-6").rows(np.array([0.0, 0.05]), np.random.default_rng(0))[0]
 _SIGMA = np.full(6, 0.5)  # m, m/s
 _KNOWN = {"target_spread": (0.0, 0.0)}
 _RING = np.array([[0, 1, 3], [1, 0, 2], [2, 1, 3], [3, 2, 0]])

@@ -29,6 +29,9 @@ NEAREST = 61  # m, distance to the nearest vehicle, smallest over the substeps
 HEARD = 62  # messages received in this step
 ALIVE = 63
 MEASURES = 64  # whether it has the sensor
+CAUSE = 65  # why it crashed, index in `team_scores.CRASH_CAUSES`
+TERMINATED = 66
+LEFT = 67  # whether it crashed in an earlier step
 TEAM_ROW_SIZE = 72
 
 # Entries of a message's content, absolute.

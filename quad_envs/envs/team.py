@@ -12,7 +12,7 @@ from pettingzoo import ParallelEnv
 
 from ..parameters import Array
 from ..tasks import TeamTask
-from .exchange import HEARD, NEAREST, SLOT_ERROR, TERMS
+from .exchange import ALIVE, CAUSE, HEARD, NEAREST, SLOT_ERROR, TERMINATED, TERMS
 from .kernel import (
     CLIPPED,
     COST,
@@ -29,32 +29,35 @@ from .kernel import (
 from .pictures import NO_RENDERING, TeamPictures, checked_rendering
 from .team_batch import TeamBatch
 from .team_options import TeamOptions
-from .team_scores import N_LOSS
+from .team_scores import CRASH_CAUSES, N_LOSS
 
 Observation = NDArray[np.float32]
 Named = dict[str, Any]
 
 # PettingZoo asks for finite bounds; no state of a flight within the arena comes near.
 _BOUND = 1e6
+_METADATA: dict[str, Any] = {
+    "render_modes": ["human", "rgb_array"],
+    "render_fps": 20,
+    "name": "team",
+    "is_parallelizable": True,
+}
 # Entries of a row that `info` tells.
-_SAID = [COST, EPISODE_COST, VIOLATED, STAGE_COST, CRASHED, CLIPPED, SLOT_ERROR, NEAREST, HEARD]
+_SAID = [COST, EPISODE_COST, VIOLATED, STAGE_COST, CRASHED, CAUSE, CLIPPED, SLOT_ERROR, NEAREST, HEARD]
 
 
 class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: ignore[misc]
     """One team of a `TeamBatch`. The subclasses document their task."""
 
     options_type: ClassVar[type[TeamOptions]] = TeamOptions
+    metadata: ClassVar[dict[str, Any]] = _METADATA
 
     def __init__(
         self, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480), **kwargs: Any
     ) -> None:
         picture_size = checked_rendering(render_mode, ("human", "rgb_array"), render_size)
-        self.metadata = {
-            "render_modes": ["human", "rgb_array"],
-            "render_fps": 20,
-            "name": self.options_type.mission,
-            "is_parallelizable": True,
-        }
+        # PettingZoo's wrappers write into it: every environment has its own.
+        self.metadata = {**_METADATA, "name": self.options_type.mission}  # type: ignore[misc]
         self.render_mode = render_mode
         options = self.options_type.from_kwargs(kwargs)
         self._batch = TeamBatch(options, 1)
@@ -117,13 +120,16 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
     def state(self) -> Array:
         """The whole truth for centralised critics, parts as in `state_slices`, absolute, float64.
 
-        Plants (N, 16) row by row; the target's r, v (zero without one); the present weights G (N, N); the
-        leader's reference rows k..k+N_p (zero without a leader); t / T.
+        Plants (N, 16) row by row; the target's r, v (zero without one); the present weights G (N, N), with
+        rows and columns of zeros, G_ii included, for vehicles that crashed; the leader's reference rows
+        k..k+N_p (zero without a leader); t / T.
         """
         batch, k = self._batch, int(self._batch.rows[0, STEP])
         stages = self.task.layout.preview + 1
         preview = batch.references[0, k : k + stages] if batch.options.has_leader else np.zeros((stages, 8))
-        parts = (self.plants, self.target[k], batch.graph(k), preview, k / self.task.episode_steps)
+        alive = batch.rows[:, ALIVE]
+        graph = batch.graph(k) * alive * alive[:, None]
+        parts = (self.plants, self.target[k], graph, preview, k / self.task.episode_steps)
         return np.concatenate([np.ravel(part) for part in parts])
 
     def reset(
@@ -153,15 +159,15 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
         rows, which = self._batch.rows, self._rows
         if len(which) < len(rows):
             rows, observations = rows[which], observations[which]
-        crashed, truncated = rows[:, CRASHED] > 0.0, rows[:, TRUNCATED] > 0.0
+        terminated, truncated = rows[:, TERMINATED] > 0.0, rows[:, TRUNCATED] > 0.0
         answer = (
             dict(zip(agents, observations, strict=True)),
             dict(zip(agents, rows[:, REWARD].tolist(), strict=True)),
-            dict(zip(agents, crashed.tolist(), strict=True)),
+            dict(zip(agents, terminated.tolist(), strict=True)),
             dict(zip(agents, truncated.tolist(), strict=True)),
             self._infos(),
         )
-        done = crashed | truncated
+        done = terminated | truncated
         if done.any():
             self._rows = which[~done]
             self.agents = [self.possible_agents[i] for i in self._rows]
@@ -187,11 +193,13 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
         agents = self.agents
         try:
             rows = [actions[name] for name in agents]
+            fits = set(map(len, rows)) == {self._action_size} and len(actions) == len(agents)
             joined = np.concatenate(rows, dtype=np.float32, casting="same_kind")
         except (KeyError, TypeError, ValueError):
-            joined = np.zeros(0, dtype=np.float32)
-        if not agents or len(actions) != len(agents) or joined.shape != (len(agents) * self._action_size,):
+            fits = False
+        if not fits or joined.ndim != 1:
             self._check(actions)
+            joined = np.concatenate([actions[name] for name in agents]).astype(np.float32)
         if len(agents) == len(self.possible_agents):
             return joined
         out = np.zeros((len(self.possible_agents), self._action_size), dtype=np.float32)
@@ -234,13 +242,18 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
                 "constraint_values": values,
                 "stage_cost": loss,
                 "crashed": crashed > 0.0,
+                "crash_cause": CRASH_CAUSES[int(cause)],
                 "clipped_actions": int(clipped),
                 "formation_error": error,
                 "min_separation": nearest,
                 "messages": int(heard),
                 "reward_terms": terms,
             }
-            for (cost, total, violated, loss, crashed, clipped, error, nearest, heard), values, terms in zip(
+            for (
+                (cost, total, violated, loss, crashed, cause, clipped, error, nearest, heard),
+                values,
+                terms,
+            ) in zip(
                 rows[:, _SAID].tolist(),
                 rows[:, VALUES : VALUES + n].copy(),
                 rows[:, TERMS : TERMS + N_LOSS + n].copy(),

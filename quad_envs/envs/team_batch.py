@@ -40,9 +40,9 @@ class TeamBatch:
     """
 
     def __init__(self, options: TeamOptions, teams: int) -> None:
-        self.options, self.teams, self.task = options, teams, options.make_task()
+        self.options, self.teams, self.task = options, teams, options.task
         self.n = options.vehicles
-        self.slots, self.graphs = options.make_slots(), options.make_graphs()
+        self.slots, self.graphs = np.array(self.task.slots), options.graphs
         layout = self.task.layout
         depth = options.delay + 1
         content = PLAN + 6 * layout.plan
@@ -245,7 +245,7 @@ class TeamBatch:
 
 def _team_vector(options: TeamOptions, sensed: int) -> Array:
     """The team's part of the task in the form that the kernels read, see `exchange`."""
-    task = options.make_task()
+    task = options.task
     scales = np.ones(5)
     named = constraint_scales(task.limits, task.dt)
     scales[: named.size] = named

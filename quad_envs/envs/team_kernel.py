@@ -20,6 +20,7 @@ from .exchange import (
     DISTURBANCE,
     DRAW,
     HEARD,
+    LEFT,
     MEASUREMENT,
     MEASURES,
     N_MOTION,
@@ -45,7 +46,6 @@ from .kernel import (
     CLIPPED,
     COEFFICIENTS,
     COMMAND,
-    COST,
     DT,
     EPISODE_COST,
     FORCE_MAX,
@@ -178,7 +178,7 @@ def _inform_team(
             measure_target(motions[i], aim, draws, k, i, row[MEASURES], team, now[i, MEASUREMENT:])
     for i in range(n):
         row = rows[first + i]
-        if row[ALIVE] > 0.0:
+        if row[LEFT] == 0.0:  # who crashes in this step still sees where
             hear(k, i, rows, first, history, tables, team, messages[i])
             count = sense(i, rows, first, motions, team, key, near)
             observe_agent(
@@ -310,8 +310,6 @@ def step_teams(
                 _ride(rows, begin, tables, actions, task, wanted)
             else:
                 judge_team(rows, begin, tables, previous[begin - first :], wanted, task, team)
-                for i in range(begin, begin + n):
-                    rows[i, EPISODE_COST] += rows[i, COST] if rows[i, ALIVE] > 0.0 else 0.0
             _inform_team(
                 rows, begin, messages[begin : begin + n], history[begin // n], tables, task, team,
                 rest, out[begin : begin + n],
@@ -371,4 +369,6 @@ def begin_team(
             for a in range(4):
                 scratch[4 * i + a] = rows[begin + i, COMMAND][a]
         judge_team(rows, begin, tables, scratch[: 4 * n].reshape(n, 4), wanted, task, team)
+        for i in range(n):
+            rows[begin + i, EPISODE_COST] = 0.0
     _inform_team(rows, begin, messages[begin : begin + n], past, tables, task, team, rest, out)

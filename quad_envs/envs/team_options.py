@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
 from ..agent_observations import AgentLayout
-from ..formations import FORMATIONS, make_formation, nearest_pair
+from ..formations import FORMATIONS, make_formation, nearest_pair, start_positions
 from ..graphs import (
     GraphLike,
     GraphSchedule,
@@ -23,7 +23,7 @@ from ..graphs import (
 from ..parameters import Array
 from ..references import Reference, make_reference
 from ..sensors import sensor_rows
-from ..targets import ConstantVelocity, Target, make_target
+from ..targets import Target, make_target
 from ..tasks import TeamTask
 from .vehicle_options import Triple, VehicleOptions, is_number, spread
 
@@ -39,7 +39,6 @@ CHAPTER_7_SLOTS = (
     (-2.2, 0.0, 0.8),
 )
 CHAPTER_6_RAILS = ((0.0, 0.0, 0.0), (4.0, 0.0, -1.0), (0.0, 4.0, 1.0), (4.0, 4.0, -2.0))
-CHAPTER_6_TARGET = ConstantVelocity(position=(3.0, 3.0, -6.0), velocity=(0.8, 0.3, -0.1), q=0.02)
 _STAGGER = 0.4  # m, up and down in turn: a plane of vehicles cannot tell the target from its mirror image
 _BEHIND = (-1.0, 0.0, 0.0)  # m, of a named formation relative to the target
 
@@ -77,6 +76,9 @@ class TeamOptions(VehicleOptions):
     terminate: Terminate = "team"
     arena: float = 100.0
     formation_weight: float = 1.0
+    # Made once from the rest, because a graph may come from a user's function.
+    graphs: GraphTable = field(init=False, repr=False, compare=False)
+    task: TeamTask = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.max_cycles is not None:
@@ -93,14 +95,36 @@ class TeamOptions(VehicleOptions):
                 allowed = " or ".join(map(repr, get_args(kind)))
                 raise ValueError(f"{name} must be {allowed}, got {getattr(self, name)!r}")
         self._require_range("drop_out", 0.0, 1.0)
-        self._require_range("message_lifetime", self.delay * self.dt, math.inf)
+        if not (is_number(self.message_lifetime) and self.message_lifetime >= self.delay * self.dt):
+            raise ValueError(
+                f"message_lifetime must be a finite number of seconds and at least the delay of {self.delay} "
+                f"steps = {self.delay * self.dt:g} s, or messages expire on their way; "
+                f"got {self.message_lifetime!r}"
+            )
         self._require_range("leader_weight", 0.0, math.inf)
         self._require_range("formation_weight", 0.0, math.inf)
         if self.crash_distance >= self.separation:
             raise ValueError(
                 f"crash_distance {self.crash_distance!r} m must be below the separation {self.separation!r} m"
             )
-        self.make_task()
+        self.make_slots()  # what is wrong with the formation is said before what follows from it
+        object.__setattr__(self, "graphs", self._make_graphs())
+        object.__setattr__(self, "task", self._make_task())
+        self.check_start()
+
+    def check_start(self) -> None:
+        """Refuse a start that cannot be flown.
+
+        Raises:
+            ValueError: If it is unknown, of the wrong size, or two vehicles start in a crash.
+        """
+        p = start_positions(self.start, np.array(self.task.slots), np.random.default_rng(0), self.separation)
+        i, j, least = nearest_pair(p)
+        if least < self.crash_distance:
+            raise ValueError(
+                f"vehicles {i} and {j} start {least:.3g} m apart, which is a crash (crash_distance = "
+                f"{self.crash_distance:g} m); move them apart"
+            )
 
     def _require_range(self, name: str, low: float, high: float) -> None:
         value = getattr(self, name)
@@ -111,7 +135,7 @@ class TeamOptions(VehicleOptions):
         """Wanted positions p_i*, (N, 3), m, relative to the leader's or to the target."""
         return make_formation(self.formation, self.vehicles, self.spacing, self.separation)
 
-    def make_graphs(self) -> GraphTable:
+    def _make_graphs(self) -> GraphTable:
         """The graphs of an episode; a link toward the leader weighs `leader_weight` where weights are 1."""
         name = self.formation if isinstance(self.formation, str) and self.formation in FORMATIONS else None
         table = make_graph_table(self.graph, name, self.vehicles, self.episode_steps, self.dt)
@@ -125,12 +149,16 @@ class TeamOptions(VehicleOptions):
         return [0]
 
     def make_task(self) -> TeamTask:
-        """The value from which policies are built.
+        """The value from which policies are built."""
+        return self.task
+
+    def _make_task(self) -> TeamTask:
+        """The task that follows from the options.
 
         Raises:
             ValueError: If a vehicle hears more neighbours than there are slots.
         """
-        slots, graphs = self.make_slots(), self.make_graphs()
+        slots, graphs = self.make_slots(), self.graphs
         if len(slots) != self.vehicles:
             raise ValueError(f"vehicles must be {len(slots)}, one per slot, got {self.vehicles!r}")
         in_degree = in_neighbours(graphs.graphs).shape[1]
@@ -231,6 +259,11 @@ class TargetTrackingOptions(TeamOptions):
 
     def __post_init__(self) -> None:
         self._require_range("detection", 0.0, 1.0)
+        if not isinstance(self.sensor_sigma, tuple):
+            raise ValueError(
+                "sensor_sigma must be three standard deviations, of range, m, azimuth, rad, and elevation, "
+                f"rad; got {self.sensor_sigma!r}"
+            )
         for name, length in (
             *(("sensor_sigma", 3), ("prior_velocity", 3), ("prior_sigma", 2), ("target_spread", 2)),
         ):
@@ -259,6 +292,8 @@ class TargetTrackingOptions(TeamOptions):
 
     def informed(self) -> list[int]:
         """Vehicles that measure the target."""
+        if self.detection == 0.0:
+            return []
         if isinstance(self.measuring, str):
             if self.measuring != "all":
                 raise ValueError(f"measuring must be 'all' or vehicle numbers, got {self.measuring!r}")
@@ -290,7 +325,7 @@ class EstimationOptions(TargetTrackingOptions):
     graph: str | GraphLike | GraphSchedule = "chapter-6"
     rails: _Rows = CHAPTER_6_RAILS
     rail_velocity: Triple = (0.8, 0.3, -0.1)
-    target: str | Target | Reference = CHAPTER_6_TARGET
+    target: str | Target | Reference = "chapter-6"
     target_spread: tuple[float, float] = (0.5, 0.5)
     prior_velocity: Triple = (0.8, 0.3, -0.1)
     prior_sigma: tuple[float, float] = (0.5, 0.5)
@@ -298,8 +333,16 @@ class EstimationOptions(TargetTrackingOptions):
     def __post_init__(self) -> None:
         if self.comm == "plan":
             raise ValueError("comm='plan' needs vehicles that fly; on rails choose comm='state'")
+        defaults = {entry.name: entry.default for entry in fields(TargetTrackingOptions)}
+        for name in ("formation", "spacing", "start"):
+            if getattr(self, name) != defaults[name]:
+                raise ValueError(f"{name} has no effect on vehicles on rails: leave it out, or change rails")
         object.__setattr__(self, "rail_velocity", spread("rail_velocity", self.rail_velocity, 3))
         TargetTrackingOptions.__post_init__(self)
+
+    def check_start(self) -> None:
+        """Vehicles on rails start there."""
+        self.rail_positions()
 
     def rail_positions(self) -> Array:
         """Where the vehicles start, (N, 3), m."""

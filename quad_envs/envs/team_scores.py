@@ -8,12 +8,15 @@ from .._numba import inline_kernel, kernel
 from ..constraints import TOLERANCE
 from ..parameters import Array
 from ..reward import stage_cost_parts
+from ..tasks import LOSS_PARTS
 from .exchange import (
     ALIVE,
     ARENA,
+    CAUSE,
     CRASH_DISTANCE,
     FORMATION_WEIGHT,
     HAS_LEADER,
+    LEFT,
     N_VALUES,
     NEAREST,
     REFERENCE,
@@ -21,6 +24,7 @@ from .exchange import (
     SEPARATION,
     SLOT_ERROR,
     TARGET,
+    TERMINATED,
     TERMS,
     WHOLE_TEAM,
     Tables,
@@ -29,6 +33,7 @@ from .kernel import (
     COMMAND,
     COST,
     CRASHED,
+    EPISODE_COST,
     EPISODE_STEPS,
     HOVER,
     QUADRATIC,
@@ -44,7 +49,9 @@ from .kernel import (
     violation_cost,
 )
 
-N_LOSS = 6  # parts of the stage cost: position, velocity, attitude, rates, effort, formation
+N_LOSS = len(LOSS_PARTS)
+CRASH_CAUSES = ("", "distance", "tilt", "arena", "not finite")
+_DISTANCE, _TILT, _ARENA, _NOT_FINITE = range(1, 5)
 
 
 @inline_kernel
@@ -85,12 +92,16 @@ def _judge_flight(
     off = (row[0] - wanted[0]) ** 2 + (row[1] - wanted[1]) ** 2 + (row[2] - wanted[2]) ** 2
     row[SLOT_ERROR] = math.sqrt(off)
     from_origin = row[0] * row[0] + row[1] * row[1] + row[2] * row[2]
-    crashed = (
-        not row[NEAREST] >= team[CRASH_DISTANCE]  # also where it is nan: the state was not finite
-        or abs(row[6]) >= task[TILT_OF_CRASH]
-        or abs(row[7]) >= task[TILT_OF_CRASH]
-        or from_origin > team[ARENA] * team[ARENA]
-    )
+    if math.isnan(row[NEAREST]):
+        row[CAUSE] = _NOT_FINITE
+    elif row[NEAREST] > 2.0 * team[ARENA]:
+        row[NEAREST] = 2.0 * team[ARENA]  # nobody else flies
+    if row[NEAREST] < team[CRASH_DISTANCE]:
+        row[CAUSE] = _DISTANCE
+    elif max(abs(row[6]), abs(row[7])) >= task[TILT_OF_CRASH]:
+        row[CAUSE] = _TILT
+    elif from_origin > team[ARENA] * team[ARENA]:
+        row[CAUSE] = _ARENA
     cost = violation_cost(row, previous, task)
     last = int(team[N_VALUES]) - 1
     row[VALUES + last] = team[SEPARATION] - row[NEAREST]
@@ -99,7 +110,8 @@ def _judge_flight(
     for k in range(last + 1):
         value = row[VALUES + k]
         row[TERMS + N_LOSS + k] = value / team[SCALES + k] if value > TOLERANCE else 0.0
-    _score(row, loss, cost, crashed, task)
+    _score(row, loss, cost, row[CAUSE] > 0.0, task)
+    row[EPISODE_COST] += cost
 
 
 @inline_kernel
@@ -160,12 +172,14 @@ def judge_team(
             _want(k, i, first, tables, team, wanted)
             _judge_flight(row, wanted, previous[i], _formation_error(k, i, rows, first, tables), task, team)
             anybody = anybody or row[CRASHED] > 0.0
-        else:
-            row[REWARD] = 0.0
+        else:  # it left in an earlier step, and nothing counts any more
+            row[REWARD], row[STAGE_COST], row[COST], row[VIOLATED], row[LEFT] = 0.0, 0.0, 0.0, 0.0, 1.0
+            for k in range(TERMS, TERMS + N_LOSS + int(team[N_VALUES])):
+                row[k] = 0.0
     for i in range(n):
         row = rows[first + i]
         if anybody and team[WHOLE_TEAM] > 0.0:
-            row[CRASHED], row[TRUNCATED] = 1.0, 0.0
+            row[CRASHED], row[TERMINATED], row[TRUNCATED] = 1.0, 1.0, 0.0
             row[REWARD] = row[REWARD] if task[QUADRATIC] > 0.0 else 0.0
         elif row[CRASHED] > 0.0:
-            row[ALIVE] = 0.0
+            row[TERMINATED], row[ALIVE] = 1.0, 0.0

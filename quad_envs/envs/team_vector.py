@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..parameters import Array
 from ..tasks import TeamTask
-from .exchange import ALIVE, HEARD, NEAREST, SLOT_ERROR, TERMS
+from .exchange import ALIVE, CAUSE, HEARD, NEAREST, SLOT_ERROR, TERMINATED, TERMS
 from .kernel import (
     CLIPPED,
     COST,
@@ -30,7 +30,7 @@ from .kernel import (
 )
 from .team_batch import TeamBatch
 from .team_options import TeamOptions
-from .team_scores import N_LOSS
+from .team_scores import CRASH_CAUSES, N_LOSS
 
 Observations = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -76,6 +76,7 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._generators: list[np.random.Generator] = []
         self._done: Bools = np.zeros(self.num_teams, dtype=np.bool_)
+        self._seen = np.zeros((self.num_envs, size), dtype=np.float32)  # for teams that a reset leaves alone
 
     @property
     def task(self) -> TeamTask:
@@ -100,18 +101,43 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Begin an episode of every team; a seed s is s + t for team t.
+        """Begin episodes: of every team, or of those in `options["reset_mask"]`.
 
         Args:
-            seed: One number, one per team, or None to draw on.
-            options: As in the parallel environment, the same for all teams.
+            seed: One number s (team t gets s + t), one per team, or None to draw on.
+            options: As in the parallel environment, the same for all teams; "reset_mask" is bool, one per
+                team, or one per row with all rows of a team alike.
+
+        Raises:
+            ValueError: If the mask does not fit, or leaves out a team before the first reset.
         """
+        given = dict(options or {})
+        mask = self._team_mask(given.pop("reset_mask", None))
         self._seed(seed)
-        observations = self._fresh_observations()
-        for t in range(self.num_teams):
-            self._reset_team(t, observations, options)
-        self._done[:] = False
+        observations = self._seen.copy()
+        for t in np.flatnonzero(mask).tolist():
+            self._reset_team(t, observations, given)
+        self._done[mask] = False
+        self._seen = observations.copy()
         return observations, self._info()
+
+    def _team_mask(self, mask: Any) -> Bools:
+        """Which teams a reset begins anew, (n,)."""
+        if mask is None:
+            return np.ones(self.num_teams, dtype=np.bool_)
+        given = np.asarray(mask, dtype=np.bool_)
+        if given.shape == (self.num_envs,):
+            rows = given.reshape(self.num_teams, -1)
+            if (rows.any(axis=1) != rows.all(axis=1)).any():
+                raise ValueError("reset_mask must be alike for all vehicles of a team: a team begins as one")
+            given = np.asarray(rows.all(axis=1))
+        if given.shape != (self.num_teams,):
+            raise ValueError(
+                f"reset_mask must have shape ({self.num_teams},) or ({self.num_envs},), got {given.shape}"
+            )
+        if not (given.all() or self._generators):
+            raise ValueError("the first reset must begin all teams; reset_mask is for later ones")
+        return given
 
     def step(self, actions: NDArray[np.float32]) -> tuple[Observations, Array, Bools, Bools, dict[str, Any]]:
         """Hold the rotor commands of all vehicles over one control period."""
@@ -130,9 +156,10 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
             self._reset_team(t, observations, None)
         rows = self._batch.rows
         rewards = np.where(begins, 0.0, rows[:, REWARD])
-        terminated, truncated = rows[:, CRASHED] > 0.0, rows[:, TRUNCATED] > 0.0
-        truncated &= ~terminated
+        terminated = rows[:, TERMINATED] > 0.0
+        truncated = (rows[:, TRUNCATED] > 0.0) & ~terminated
         self._done = np.asarray((terminated | truncated).reshape(self.num_teams, -1).all(axis=1))
+        self._seen = observations
         return observations, rewards, terminated, truncated, self._info()
 
     def _reset_team(self, t: int, observations: Observations, options: dict[str, Any] | None) -> None:
@@ -168,6 +195,7 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
             "constraint_values": rows[:, VALUES : VALUES + n].copy(),
             "stage_cost": rows[:, STAGE_COST].copy(),
             "crashed": rows[:, CRASHED] > 0.0,
+            "crash_cause": np.array(CRASH_CAUSES)[rows[:, CAUSE].astype(np.int64)],
             "clipped_actions": rows[:, CLIPPED].astype(np.int64),
             "formation_error": rows[:, SLOT_ERROR].copy(),
             "min_separation": rows[:, NEAREST].copy(),

@@ -117,7 +117,7 @@ class VehicleOptions:
         Raises:
             TypeError: If a name is unknown; the message suggests the nearest one.
         """
-        known = [field.name for field in fields(cls)]
+        known = [entry.name for entry in fields(cls) if entry.init]
         for name in kwargs:
             if name not in known:
                 known.remove("env_id")
