@@ -242,7 +242,7 @@ def make_cooperative_mpc(
     for estimation, 0.05 for tracking. `estimates` is "own", a filter per agent in `state`, or "shared", what
     `EstimateWrapper` put into the observation; None: shared where it is there.
 
-    Behind the target "aircraft", which flies up to 2.5 m/s, 1.24 m of error (RMS of the last 5 s, four flights)
+    Behind the target "aircraft", at up to 2.5 m/s, 1.24 m of error (RMS of the last 5 s, four flights)
     are left, and a higher `speed` is no remedy: 1.21 m with 3 or 4 m/s, where one of the four flights crashes
     on the way there (0.307 m after 3 s).
 
