@@ -9,8 +9,8 @@ minimises the sum of their costs (5.5) within box and rate of the rotors and, so
 
 The normals a_ijn follow the previous plan, so that a pair that has begun to pass keeps its sides. OSQP solves
 it, set up anew and started cold at each sample: nothing is kept outside the memory, so that a flight can be
-repeated, and that costs no more time than updating. The matrices are filled as dense ones, which limits the
-team: their size grows with the fourth power of the number of vehicles.
+repeated. The matrices are filled as dense ones, which limits the team: their size grows with the fourth power
+of the number of vehicles.
 """
 
 from __future__ import annotations
