@@ -20,13 +20,13 @@ from quad_envs.rotations import rotation_body_from_inertial
 from quad_envs.tasks import TeamTask
 
 DT = 0.05  # s
-_STAGES = 6  # the present one and a horizon of 5
+_HORIZON = 5
 Preview = Callable[[int, Array, Array], tuple[Array, Array]]
 
 
-def team_task(vehicles: int) -> TeamTask:
+def team_task(vehicles: int, horizon: int = _HORIZON) -> TeamTask:
     """A task in which nobody hears anybody and all sense all."""
-    layout = AgentLayout(preview=_STAGES - 1, neighbours=0, sensed=vehicles - 1)
+    layout = AgentLayout(preview=horizon, neighbours=0, sensed=vehicles - 1)
     return TeamTask(layout=layout, limits=Limits(tilt=1.2), vehicles=vehicles)
 
 
@@ -37,7 +37,7 @@ def fly_led(controller: CooperativeMpc, start: Array, preview: Preview, steps: i
         controller: Of one team.
         start: Positions at rest, (teams, N, 3), m.
         preview: Step, positions and inertial velocities (teams, N, 3) -> references of position and velocity
-            for the stages 0..5, (teams, N, 6, 3) each.
+            for the stages 0..horizon, (teams, N, horizon + 1, 3) each.
         steps: Control periods.
 
     Returns:
@@ -54,9 +54,10 @@ def fly_led(controller: CooperativeMpc, start: Array, preview: Preview, steps: i
         p = plants[:, :3].reshape(teams, n, 3)
         v = np.einsum("nba,nb->na", rotation_body_from_inertial(plants[:, 6:9]), plants[:, 3:6])
         r, w = preview(k, p, v.reshape(teams, n, 3))
-        heading = np.broadcast_to([0.0, 1.0], (rows, _STAGES, 2))
-        window = np.concatenate([(r - p[:, :, None]).reshape(rows, _STAGES, 3),
-                                 w.reshape(rows, _STAGES, 3), heading], axis=-1)  # fmt: skip
+        stages = r.shape[2]
+        heading = np.broadcast_to([0.0, 1.0], (rows, stages, 2))
+        window = np.concatenate([(r - p[:, :, None]).reshape(rows, stages, 3),
+                                 w.reshape(rows, stages, 3), heading], axis=-1)  # fmt: skip
         sensed = sensed_rows(p, v.reshape(teams, n, 3), task).reshape(rows, -1, 7)
         decision = controller.decide(
             plants, last, leads, window, comm, sensed, None, None, None, None, disturbance, memory
@@ -110,7 +111,8 @@ def meet(
         jitter: Standard deviation of the starts, m.
     """
     options = {"reach": np.inf, "speed": np.inf, "alpha": 0.5, **options}
-    controller = CooperativeMpc(team_task(vehicles), **options)
+    horizon = options.get("horizon", _HORIZON)
+    controller = CooperativeMpc(team_task(vehicles, horizon), **options)
     angle = np.arange(vehicles) * 2.0 * np.pi / vehicles
     ring = 2.0 * np.stack([np.cos(angle), np.sin(angle), np.zeros(vehicles)], axis=-1)
     noise = [np.random.default_rng(seed).normal(size=ring.shape) for seed in range(runs)]
@@ -120,7 +122,7 @@ def meet(
     direction = way / length
 
     def preview(k: int, p: Array, v: Array) -> tuple[Array, Array]:
-        s = np.minimum(speed * DT * (k + np.arange(_STAGES)), length)[..., None]
+        s = np.minimum(speed * DT * (k + np.arange(horizon + 1)), length)[..., None]
         ahead = direction[:, :, None]
         return start[:, :, None] + s * ahead, np.where(s < length[..., None], speed * ahead, 0.0)
 
@@ -152,7 +154,7 @@ def literal_consensus(slots: Array, G: Array, seconds: float = 20.0) -> Array:
 
     def preview(k: int, p: Array, v: Array) -> tuple[Array, Array]:
         r, w = [p[0]], [v[0]]
-        for _ in range(_STAGES - 1):
+        for _ in range(_HORIZON):
             r.append((r[-1] + np.einsum("ij,ijc->ic", out, p[0] + delta)) / total)
             w.append((w[-1] + out @ v[0]) / total)
         for rows in (r, w):
