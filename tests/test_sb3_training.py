@@ -378,14 +378,14 @@ def test_ppo_lagrangian_is_refused_where_there_are_no_limits():
 
 @pytest.mark.slow
 def test_ppo_learns_the_shared_reward_from_scratch():
-    from time import process_time
-
-    env_id = "quad/HelixTracking-v0"
+    env_id, updates, last = "quad/HelixTracking-v0", 80, None
     task = TrackingOptions.from_kwargs({"env_id": env_id, **TRACKING[env_id]})
-    next(train_ppo(task, SMALL, 0, lambda: 0.0))  # compiles
-    begin = process_time()
-    updates = list(train_ppo(task, PpoOptions(), 0, lambda: (process_time() - begin) / 20.0))
+    done = iter(range(updates * 1000))
+    for k, (_, network) in enumerate(train_ppo(task, PpoOptions(), 0, lambda: min(next(done) / 1e4, 0.99))):
+        last = network
+        if k + 1 == updates:
+            break
     env = make_env(env_id)
-    found = evaluate(NetworkPolicy(updates[-1][1], env.unwrapped.task, "ppo"), env, 10, 10_000)
-    # Hover scores 0.02; from 0.4 to 0.6 was measured, by how busy the machine is.
-    assert found.summary()["score"].mean > 0.25
+    found = evaluate(NetworkPolicy(last, env.unwrapped.task, "ppo"), env, 10, 10_000)
+    score = found.summary()["score"].mean
+    assert score > 0.1  # hover scores 0.01, a network before training 0.005

@@ -3,10 +3,6 @@
 import csv
 import io
 import json
-import os
-import signal
-import subprocess
-import sys
 import time
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -351,27 +347,3 @@ def test_ctrl_c_says_how_to_go_on(tmp_path, capsys):
 
 def test_a_budget_counts_one_thing():
     assert Budget(seconds=10.0).share(5.0, 10**9) == 0.5 and Budget(steps=10).share(99.0, 5) == 0.5
-
-
-@pytest.mark.slow
-def test_ctrl_c_in_a_process_of_its_own(tmp_path):
-    command = [
-        sys.executable,
-        "-m",
-        "baselines",
-        "train",
-        HELIX,
-        "apg",
-        "--seconds",
-        "500",
-        "--out",
-        str(tmp_path),
-    ]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    for line in process.stderr:
-        if "score" in line:
-            break
-    os.kill(process.pid, signal.SIGINT)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 130 and "Resume with: quad-envs train" in err and "Traceback" not in err
-    assert make_policy(tmp_path, HELIX)

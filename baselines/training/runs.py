@@ -292,9 +292,7 @@ class _Run:
         best = better(point, self.best, self.limit)
         if best:
             self.best = point
-        for watcher in self._watchers:
-            watcher.judged(point, best)
-        about = self._about(point)
+        about, failure = self._about(point), ""
         try:
             if best:
                 self.folder.save_best(self.network, about)
@@ -304,8 +302,11 @@ class _Run:
         except (CheckpointError, ResultsError) as error:
             # Training may outlive a full disk; what was saved before is still whole.
             self._unsaved = error
-            for watcher in self._watchers:
-                watcher.noted(f"not saved, training goes on: {error}")
+            failure = f"not saved, training goes on: {error}"
+        for watcher in self._watchers:  # after saving: what is shown can be resumed
+            watcher.judged(point, best)
+            if failure:
+                watcher.noted(failure)
 
     def _about(self, point: Point) -> dict[str, Any]:
         """What a checkpoint says of its making."""
