@@ -129,13 +129,13 @@ def score(policy, env_id, flights=50):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
-def test_dagger_is_within_one_percent_of_its_expert_in_15_seconds(tmp_path, seed):
-    train(HELIX, "dagger", seed=seed, seconds=15, out=tmp_path)
+def test_dagger_is_within_one_percent_of_its_expert(tmp_path, seed):
+    train(HELIX, "dagger", seed=seed, steps=48_000, out=tmp_path)  # about 15 CPU-seconds
     assert score(tmp_path, HELIX) > 0.99 * score("sdc-nmpc", HELIX)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
-def test_the_policy_gradient_passes_lmpc_in_10_seconds(tmp_path, seed):
-    train(HELIX, "apg", seed=seed, seconds=10, out=tmp_path)
+def test_the_policy_gradient_passes_lmpc(tmp_path, seed):
+    train(HELIX, "apg", seed=seed, steps=550_000, out=tmp_path)  # about 10 CPU-seconds
     assert score(tmp_path, HELIX) > score("lmpc", HELIX)
