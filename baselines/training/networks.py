@@ -17,8 +17,8 @@ from quad_envs.agent_observations import AgentLayout
 from quad_envs.observations import N_REFERENCE, TrackingLayout
 from quad_envs.tasks import BaseTask, Task, TeamTask
 
+from ..network_kernels import forward_rows
 from ..policy import N_FALLBACKS, Actions, PolicyState
-from .inference import forward_rows
 
 Floats = NDArray[np.float32]
 Squash = Literal["tanh", "clip"]
