@@ -202,7 +202,7 @@ class TargetMpc(CooperativePolicy):
             parts, memory = self._decode(obs, state.memory, start)
             estimates, filters = shared_estimates(parts.estimate), np.empty((len(obs), 0))
         else:
-            parts, memory, filters, _ = done = self.estimator.step(obs, state.memory, start)
+            parts, memory, filters, *_ = done = self.estimator.step(obs, state.memory, start)
             estimates = done.estimates
         decision = self._control(parts, estimates, memory)
         return self._act(decision, filters, estimates, state, start)

@@ -46,6 +46,7 @@ class Filtered(NamedTuple):
     first: Array  # (n, a), what else the memory holds
     filters: Array  # (n, FILTER_SIZE)
     reports: Array  # (n, N_REPORT)
+    trilaterates: bool  # whether a position may enter instead of the ranges
 
     @property
     def estimates(self) -> Estimates:
@@ -54,8 +55,9 @@ class Filtered(NamedTuple):
         covariance = self.filters[:, P].reshape(n, 6, 6).copy()
         counts = self.reports[:, 1:].astype(np.int64)
         nis = self.reports[:, 0].copy()
+        fixed = counts[:, 2] > 0 if self.trilaterates else None
         return Estimates(
-            x[:, :3].copy(), x[:, 3:].copy(), covariance, nis, counts[:, 0], counts[:, 1], counts[:, 2] > 0
+            x[:, :3].copy(), x[:, 3:].copy(), covariance, nis, counts[:, 0], counts[:, 1], fixed
         )
 
 
@@ -82,7 +84,7 @@ class TargetEstimator:
             raise ValueError(f"q must be a number, m^2/s^3, got {q!r}")
         if not 0.0 <= density < np.inf:
             raise ValueError(f"q must be finite and >= 0 m^2/s^3, got {q!r}")
-        self.task, self.q = task, float(density)
+        self.task, self.q, self.trilaterates = task, float(density), trilaterate
         position, velocity = task.prior_sigma
         message = task.layout.comm_size
         data = FilterData(self.q, task.dt, position**2, velocity**2, message, MAX_RATIO)
@@ -119,7 +121,7 @@ class TargetEstimator:
         )
         if code >= 0:
             raise not_finite(obs, code, self.task.layout.slices)
-        return Filtered(parts, first, filters, reports)
+        return Filtered(parts, first, filters, reports, self.trilaterates)
 
 
 def shared_estimates(blocks: Array) -> Estimates:
@@ -155,13 +157,11 @@ class EstimatorPolicy(TeamPolicy):
 
     def __init__(self, task: TeamTask, name: str, q: float | None, trilaterate: bool) -> None:
         super().__init__(task, name, FILTER_SIZE)
-        self.estimator, self._trilaterates = TargetEstimator(task, q, trilaterate), trilaterate
+        self.estimator = TargetEstimator(task, q, trilaterate)
 
     def _decide(self, obs: Actions, state: PolicyState, start: Flags) -> tuple[Actions, PolicyState]:
         done = self.estimator.step(obs, state.memory, start)
         estimates, n = done.estimates, len(obs)
-        if not self._trilaterates:
-            estimates = estimates._replace(trilaterated=None)
         fallbacks = np.where(start[:, None], 0, state.fallbacks)
         fallbacks[:, 0] += 1  # `estimates.modes` tells how each was found
         count = np.zeros(n, dtype=np.int64)

@@ -309,6 +309,14 @@ def test_where_nothing_is_trilaterated_the_two_estimators_agree():
     np.testing.assert_array_equal(first.actions, second.actions)
 
 
+@pytest.mark.parametrize(("name", "mission"), [pair for pair in HONEST if pair[1] != "formation"])
+def test_only_a_policy_that_trilaterates_says_whether_it_did(name, mission):
+    env = MODULES[mission].parallel_env()
+    estimates = fly(make_policy(name, env), env, steps=2).state.estimates
+    said = estimates is not None and estimates.trilaterated is not None
+    assert said == (name == "trilateration")
+
+
 def test_on_rails_the_cooperative_policy_answers_with_its_estimate():
     env = cooperative_estimation_v0.parallel_env()
     flight = fly(make_policy("cooperative-mpc", env), env, steps=50)
