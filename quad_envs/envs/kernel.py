@@ -102,6 +102,21 @@ def violation_cost(row: Array, previous: Array, task: Array) -> float:
     return cost
 
 
+@inline_kernel
+def score(row: Array, stage_cost: float, cost: float, crashed: bool, task: Array) -> None:
+    """Reward of a step, see `quad_envs.reward`, and what belongs to it."""
+    v = min(1.0, cost)
+    if task[QUADRATIC] > 0.0:
+        row[REWARD] = -stage_cost - v
+    else:
+        row[REWARD] = 0.0 if crashed else (1.0 - v) / (1.0 + stage_cost)
+    row[STAGE_COST] = stage_cost
+    row[COST] = cost
+    row[VIOLATED] = 1.0 if cost > 0.0 else 0.0
+    row[CRASHED] = 1.0 if crashed else 0.0
+    row[TRUNCATED] = 1.0 if row[STEP] >= task[EPISODE_STEPS] and not crashed else 0.0
+
+
 @kernel
 def _judge(row: Array, reference: Array, previous: Array, finite: bool, task: Array) -> None:
     """Stage cost, violation, crash and reward of a row after its step; `reference` is of the new time."""
@@ -115,17 +130,7 @@ def _judge(row: Array, reference: Array, previous: Array, finite: bool, task: Ar
         or off > task[LOST] * task[LOST]
     )
     stage_cost = stage_cost_kernel(row, reference, row[COMMAND], task[HOVER], task[WEIGHT_Q], task[WEIGHT_R])
-    cost = violation_cost(row, previous, task)
-    v = min(1.0, cost)
-    if task[QUADRATIC] > 0.0:
-        row[REWARD] = -stage_cost - v
-    else:
-        row[REWARD] = 0.0 if crashed else (1.0 - v) / (1.0 + stage_cost)
-    row[STAGE_COST] = stage_cost
-    row[COST] = cost
-    row[VIOLATED] = 1.0 if cost > 0.0 else 0.0
-    row[CRASHED] = 1.0 if crashed else 0.0
-    row[TRUNCATED] = 1.0 if row[STEP] >= task[EPISODE_STEPS] and not crashed else 0.0
+    score(row, stage_cost, violation_cost(row, previous, task), crashed, task)
 
 
 @inline_kernel

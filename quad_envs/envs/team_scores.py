@@ -34,7 +34,6 @@ from .kernel import (
     COST,
     CRASHED,
     EPISODE_COST,
-    EPISODE_STEPS,
     HOVER,
     QUADRATIC,
     REWARD,
@@ -46,27 +45,13 @@ from .kernel import (
     VIOLATED,
     WEIGHT_Q,
     WEIGHT_R,
+    score,
     violation_cost,
 )
 
 N_LOSS = len(LOSS_PARTS)
 CRASH_CAUSES = ("", "distance", "tilt", "arena", "not finite")
 _DISTANCE, _TILT, _ARENA, _NOT_FINITE = range(1, 5)
-
-
-@inline_kernel
-def _score(row: Array, loss: float, cost: float, crashed: bool, task: Array) -> None:
-    """Reward and what belongs to it."""
-    v = min(1.0, cost)
-    if task[QUADRATIC] > 0.0:
-        row[REWARD] = -loss - v
-    else:
-        row[REWARD] = 0.0 if crashed else (1.0 - v) / (1.0 + loss)
-    row[STAGE_COST] = loss
-    row[COST] = cost
-    row[VIOLATED] = 1.0 if cost > 0.0 else 0.0
-    row[CRASHED] = 1.0 if crashed else 0.0
-    row[TRUNCATED] = 1.0 if row[STEP] >= task[EPISODE_STEPS] and not crashed else 0.0
 
 
 @kernel
@@ -110,7 +95,7 @@ def _judge_flight(
     for k in range(last + 1):
         value = row[VALUES + k]
         row[TERMS + N_LOSS + k] = value / team[SCALES + k] if value > TOLERANCE else 0.0
-    _score(row, loss, cost, row[CAUSE] > 0.0, task)
+    score(row, loss, cost, row[CAUSE] > 0.0, task)
     row[EPISODE_COST] += cost
 
 
@@ -123,7 +108,7 @@ def judge_estimate(row: Array, target: Array, estimate: Array, task: Array) -> N
         velocity += (estimate[3 + i] - target[3 + i]) ** 2
     row[TERMS], row[TERMS + 1] = position, velocity
     row[SLOT_ERROR] = math.sqrt(position)
-    _score(row, position + velocity, 0.0, False, task)
+    score(row, position + velocity, 0.0, False, task)
 
 
 @kernel
