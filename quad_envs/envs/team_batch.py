@@ -13,7 +13,7 @@ from .._numba import entry_of
 from ..constraints import constraint_scales
 from ..disturbances import make_disturbance
 from ..dynamics import LANES
-from ..formations import nearest_pair, start_positions
+from ..formations import start_positions
 from ..graphs import in_neighbours
 from ..names import unknown_name
 from ..observations import N_REFERENCE
@@ -146,13 +146,7 @@ class TeamBatch:
         first, n = t * self.n, self.n
         given = _given_state(options, n, self.task.hover_force)
         plants = self._start(rng) if given is None else given
-        on_rails = isinstance(self.options, EstimationOptions)
-        i, j, least = nearest_pair(plants[:, :3])
-        if not on_rails and least < self.task.crash_distance:
-            raise ValueError(
-                f"vehicles {i} and {j} start {least:.3g} m apart, which is a crash (crash_distance = "
-                f"{self.task.crash_distance:g} m); move them apart"
-            )
+        self.options.require_apart(plants[:, :3])
         for i in range(n):
             row = self.rows[first + i]
             measures = row[MEASURES]

@@ -118,7 +118,15 @@ class TeamOptions(VehicleOptions):
         Raises:
             ValueError: If it is unknown, of the wrong size, or two vehicles start in a crash.
         """
-        p = start_positions(self.start, np.array(self.task.slots), np.random.default_rng(0), self.separation)
+        slots, never = np.array(self.task.slots), np.random.default_rng(0)
+        self.require_apart(start_positions(self.start, slots, never, self.separation))
+
+    def require_apart(self, p: Array) -> None:
+        """Refuse first positions p (N, 3), m, that are a crash.
+
+        Raises:
+            ValueError: If they are.
+        """
         i, j, least = nearest_pair(p)
         if least < self.crash_distance:
             raise ValueError(
@@ -343,6 +351,9 @@ class EstimationOptions(TargetTrackingOptions):
     def check_start(self) -> None:
         """Vehicles on rails start there."""
         self.rail_positions()
+
+    def require_apart(self, p: Array) -> None:
+        """On rails nobody crashes."""
 
     def rail_positions(self) -> Array:
         """Where the vehicles start, (N, 3), m."""
