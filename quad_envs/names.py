@@ -6,9 +6,15 @@ import difflib
 from collections.abc import Iterable
 
 
+def nearest_name(name: object, known: Iterable[str]) -> str | None:
+    """The known name that this one is a slip of, if there is one."""
+    near = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
+    return near[0] if near else None
+
+
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> str:
     """An error message with the nearest known name, if there is one, and all of them."""
     names = list(known)
-    near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)
-    hint = f"did you mean {near[0]!r}? " if near else ""
+    near = nearest_name(name, names)
+    hint = "" if near is None else f"did you mean {near!r}? "
     return f"unknown {kind} {name!r}; {hint}known: {', '.join(names) if names else 'none'}"

@@ -105,7 +105,7 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
     @property
     def target(self) -> Array:
         """Rows r, v of the target in this episode, (T+1, 6); zero where there is none. For study."""
-        return self._batch.target(0)
+        return self._batch.target(0).copy()
 
     @property
     def senders(self) -> NDArray[np.int64]:
@@ -129,7 +129,7 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
         preview = batch.references[0, k : k + stages] if batch.options.has_leader else np.zeros((stages, 8))
         alive = batch.rows[:, ALIVE]
         graph = batch.graph(k) * alive * alive[:, None]
-        parts = (self.plants, self.target[k], graph, preview, k / self.task.episode_steps)
+        parts = (self.plants, batch.target(0)[k], graph, preview, k / self.task.episode_steps)
         return np.concatenate([np.ravel(part) for part in parts])
 
     def reset(

@@ -15,12 +15,12 @@ from ..disturbances import make_disturbance
 from ..dynamics import LANES
 from ..formations import start_positions
 from ..graphs import in_neighbours
-from ..names import unknown_name
+from ..names import nearest_name, unknown_name
 from ..observations import N_REFERENCE
 from ..parameters import N_STATE, Array
 from ..references import make_reference, pack_rows
 from ..sensors import sensor_rows
-from ..targets import make_target
+from ..targets import N_TARGET, make_target
 from .exchange import DISTURBANCE, DRAW, HEAD, MEASURES, NOISE, PLAN, REFERENCE, TARGET, TEAM_ROW_SIZE
 from .kernel import COEFFICIENTS, COMMAND, FORCE_MAX, PLANT, task_vector
 from .tables import checked_rows, disturbance_rows, draw_vehicle, reference_rows, stage_times
@@ -29,7 +29,6 @@ from .team_options import EstimationOptions, FormationOptions, TargetTrackingOpt
 from .vehicle_options import CRASH_TILT
 
 _step = entry_of(step_teams)
-_N_TARGET = 6
 _RESET_OPTIONS = ("state",)
 
 
@@ -50,7 +49,7 @@ class TeamBatch:
         self._messages = np.zeros((teams * self.n, layout.neighbours, HEAD + content))
         self._history = np.zeros((teams, depth, self.n, content))
         self._vector = task_vector(self.task, options.substeps, math.inf)
-        self._team = _team_vector(options, self.task.layout.sensed)
+        self._team = _team_vector(options)
         self.neighbours = np.full((self.n, layout.neighbours), -1, dtype=np.int64)
         found = in_neighbours(self.graphs.graphs)
         self.neighbours[:, : found.shape[1]] = found
@@ -94,7 +93,7 @@ class TeamBatch:
         n_periods = steps if self._disturbance else 0
         self.disturbances: Array = np.zeros((count[DISTURBANCE], n_periods, self._nodes.shape[1], 6))
         self.noises: Array = np.zeros((count[NOISE], steps + 1 if noisy else 0, N_STATE))
-        self.targets: Array = np.zeros((count[TARGET], steps + 1 if self._target else 0, _N_TARGET))
+        self.targets: Array = np.zeros((count[TARGET], steps + 1 if self._target else 0, N_TARGET))
         self._draws = np.zeros((count[DRAW], steps + 1 if self._random[DRAW] else 0, n, width))
         self._which = np.zeros((5, teams * n), dtype=np.int64)
         for kind in range(5):
@@ -172,10 +171,10 @@ class TeamBatch:
         begin_team(first, *self._state, *self._begin, out)
 
     def target(self, t: int) -> Array:
-        """Rows r, v of the target of team t, (T+1, 6); zero where there is none."""
+        """Rows r, v of the target of team t, a view, (T+1, 6); zero where there is none."""
         if self._target is None:
-            return np.zeros((self.task.episode_steps + 1, _N_TARGET))
-        return np.array(self.targets[self._which[TARGET, t * self.n]])
+            return np.broadcast_to(0.0, (self.task.episode_steps + 1, N_TARGET))
+        return np.asarray(self.targets[self._which[TARGET, t * self.n]])
 
     def wanted(self, t: int) -> Array:
         """Where each vehicle of team t should be, rows as in a reference, (N, T+1, 8)."""
@@ -229,15 +228,15 @@ class TeamBatch:
         """Rows r, v of the target, displaced by what is not known of its start."""
         assert self._target is not None
         times = self._times[: self.task.episode_steps + 1]
-        rows = checked_rows("target", self._target, self._target.rows(times, rng), times, _N_TARGET)
+        rows = checked_rows("target", self._target, self._target.rows(times, rng), times, N_TARGET)
         if max(self._spread) > 0.0:
-            offset = np.repeat(np.asarray(self._spread), 3) * rng.standard_normal(_N_TARGET)
+            offset = np.repeat(np.asarray(self._spread), 3) * rng.standard_normal(N_TARGET)
             rows = rows + offset
             rows[:, :3] += times[:, None] * offset[3:]
         return rows
 
 
-def _team_vector(options: TeamOptions, sensed: int) -> Array:
+def _team_vector(options: TeamOptions) -> Array:
     """The team's part of the task in the form that the kernels read, see `exchange`."""
     task = options.task
     scales = np.ones(5)
@@ -261,7 +260,7 @@ def _team_vector(options: TeamOptions, sensed: int) -> Array:
             options.detection if isinstance(options, TargetTrackingOptions) else 0.0,
             task.layout.plan,
             len(task.constraint_names),
-            sensed,
+            task.layout.sensed,
             *task.sensor_sigma,
             *scales,
         ],
@@ -272,7 +271,7 @@ def _team_vector(options: TeamOptions, sensed: int) -> Array:
 def _given_state(options: Mapping[str, Any] | None, n: int, hover: float) -> Array | None:
     """Plants (N, 16) from the reset options. Foreign options pass, as PettingZoo's tests demand."""
     for name in options or {}:
-        if name not in _RESET_OPTIONS and "did you mean" in unknown_name("", name, _RESET_OPTIONS):
+        if name not in _RESET_OPTIONS and nearest_name(name, _RESET_OPTIONS) is not None:
             raise ValueError(unknown_name("reset option", name, _RESET_OPTIONS))
     if not options or "state" not in options:
         return None
