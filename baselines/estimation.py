@@ -56,9 +56,7 @@ class Filtered(NamedTuple):
         counts = self.reports[:, 1:].astype(np.int64)
         nis = self.reports[:, 0].copy()
         fixed = counts[:, 2] > 0 if self.trilaterates else None
-        return Estimates(
-            x[:, :3].copy(), x[:, 3:].copy(), covariance, nis, counts[:, 0], counts[:, 1], fixed
-        )
+        return Estimates(x[:, :3].copy(), x[:, 3:].copy(), covariance, nis, counts[:, 0], counts[:, 1], fixed)
 
 
 class TargetEstimator:
