@@ -298,6 +298,16 @@ def test_a_masked_reset_begins_only_its_teams_anew():
         formation_v0.vector_env(2).reset(options={"reset_mask": np.array([True, False])})
 
 
+def test_a_seed_of_a_masked_reset_is_for_its_teams_alone():
+    env, plain = (formation_v0.vector_env(2, autoreset_mode="Disabled") for _ in range(2))
+    second = {"reset_mask": np.array([False, True])}
+    for vector in (env, plain):
+        vector.reset(seed=0)
+    env.reset(seed=7, options={"reset_mask": np.array([True, False])})
+    drawn, expected = (vector.reset(options=second)[0][6:] for vector in (env, plain))
+    assert np.array_equal(drawn, expected)
+
+
 def test_a_batch_refuses_what_it_cannot_do():
     with pytest.raises(ValueError, match="NEXT_STEP or DISABLED"):
         formation_v0.vector_env(2, autoreset_mode="SameStep")

@@ -8,7 +8,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
@@ -16,21 +15,11 @@ from numpy.typing import NDArray
 from ..parameters import Array
 from ..tasks import TeamTask
 from .exchange import ALIVE, CAUSE, HEARD, NEAREST, SLOT_ERROR, TERMINATED, TERMS
-from .kernel import (
-    CLIPPED,
-    COST,
-    CRASHED,
-    EPISODE_COST,
-    PLANT,
-    REWARD,
-    STAGE_COST,
-    TRUNCATED,
-    VALUES,
-    VIOLATED,
-)
+from .kernel import PLANT, REWARD, TRUNCATED
 from .team_batch import TeamBatch
 from .team_options import TeamOptions
 from .team_scores import CRASH_CAUSES, N_LOSS
+from .vector_parts import Generators, score_infos, seeded, with_presence
 
 Observations = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -74,7 +63,7 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self._generators: list[np.random.Generator] = []
+        self._generators: Generators = []
         self._done: Bools = np.zeros(self.num_teams, dtype=np.bool_)
         self._seen = np.zeros((self.num_envs, size), dtype=np.float32)  # for teams that a reset leaves alone
 
@@ -104,7 +93,8 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
         """Begin episodes: of every team, or of those in `options["reset_mask"]`.
 
         Args:
-            seed: One number s (team t gets s + t), one per team, or None to draw on.
+            seed: One number s (team t gets s + t), one per team, or None to draw on; a team that goes on
+                keeps its generator.
             options: As in the parallel environment, the same for all teams; "reset_mask" is bool, one per
                 team, or one per row with all rows of a team alike.
 
@@ -113,7 +103,7 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
         """
         given = dict(options or {})
         mask = self._team_mask(given.pop("reset_mask", None))
-        self._seed(seed)
+        self._generators = seeded(self._generators, seed, mask)
         observations = self._seen.copy()
         for t in np.flatnonzero(mask).tolist():
             self._reset_team(t, observations, given)
@@ -166,42 +156,17 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
         n = self.task.vehicles
         self._batch.reset_team(t, self._generators[t], observations[t * n : (t + 1) * n], options)
 
-    def _seed(self, seed: int | Sequence[int | None] | None) -> None:
-        if seed is None and self._generators:
-            return
-        if seed is None or isinstance(seed, int | np.integer):
-            seeds: Sequence[int | None] = [
-                None if seed is None else int(seed) + t for t in range(self.num_teams)
-            ]
-        else:
-            seeds = seed
-        if len(seeds) != self.num_teams:
-            raise ValueError(f"seed must be one number or {self.num_teams} of them, got {len(seeds)}")
-        fresh = [seeding.np_random(value)[0] for value in seeds]
-        keep = self._generators or fresh
-        self._generators = [
-            new if value is not None else old for value, new, old in zip(seeds, fresh, keep, strict=True)
-        ]
-
     def _fresh_observations(self) -> Observations:
         return np.empty((self.num_envs, self.task.layout.size), dtype=np.float32)
 
     def _info(self) -> dict[str, Any]:
         rows, n = self._batch.rows, len(self.task.constraint_names)
-        info: dict[str, Any] = {
-            "cost": rows[:, COST].copy(),
-            "episode_cost": rows[:, EPISODE_COST].copy(),
-            "constraint_violation": rows[:, VIOLATED] > 0.0,
-            "constraint_values": rows[:, VALUES : VALUES + n].copy(),
-            "stage_cost": rows[:, STAGE_COST].copy(),
-            "crashed": rows[:, CRASHED] > 0.0,
+        info = score_infos(rows, n) | {
             "crash_cause": np.array(CRASH_CAUSES)[rows[:, CAUSE].astype(np.int64)],
-            "clipped_actions": rows[:, CLIPPED].astype(np.int64),
             "formation_error": rows[:, SLOT_ERROR].copy(),
             "min_separation": rows[:, NEAREST].copy(),
             "messages": rows[:, HEARD].astype(np.int64),
             "reward_terms": rows[:, TERMS : TERMS + N_LOSS + n].copy(),
             "alive": rows[:, ALIVE] > 0.0,
         }
-        present = np.ones(self.num_envs, dtype=np.bool_)
-        return info | {f"_{key}": present.copy() for key in info}
+        return with_presence(info, self.num_envs)

@@ -8,7 +8,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
@@ -16,20 +15,10 @@ from numpy.typing import NDArray
 from ..parameters import Array
 from ..tasks import Task
 from .batch import TrackingBatch
-from .kernel import (
-    CLIPPED,
-    COST,
-    CRASHED,
-    EPISODE_COST,
-    PLANT,
-    REWARD,
-    STAGE_COST,
-    TRUNCATED,
-    VALUES,
-    VIOLATED,
-)
+from .kernel import CRASHED, PLANT, REWARD, TRUNCATED
 from .options import TrackingOptions
 from .pictures import NO_RENDERING, TrackingPictures, checked_rendering
+from .vector_parts import Generators, score_infos, seeded, with_presence
 
 Observations = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -83,7 +72,7 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.floa
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (self.task.layout.size,), np.float32)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._generators: list[np.random.Generator] = []
+        self._generators: Generators = []
         self._done = np.zeros(num_envs, dtype=np.bool_)
 
     @property
@@ -118,7 +107,7 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.floa
         if not (mask.all() or self._generators):
             raise ValueError("the first reset must begin all rows; reset_mask is for later ones")
         states = self._given_states(given.pop("state", None))
-        self._seed(seed, mask)
+        self._generators = seeded(self._generators, seed, mask)
         observations = self._fresh_observations()
         for i in range(self.num_envs):
             if mask[i]:
@@ -198,37 +187,8 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.floa
         fresh["_final_info"] = done.copy()
         return fresh
 
-    def _seed(self, seed: int | Sequence[int | None] | None, mask: Bools) -> None:
-        if seed is None and self._generators:
-            return
-        if seed is None or isinstance(seed, int | np.integer):
-            seeds: Sequence[int | None] = [
-                None if seed is None else int(seed) + i for i in range(self.num_envs)
-            ]
-        else:
-            seeds = seed
-        if len(seeds) != self.num_envs:
-            raise ValueError(f"seed must be one number or {self.num_envs} of them, got {len(seeds)}")
-        fresh = [seeding.np_random(value)[0] for value in seeds]
-        if not self._generators:
-            self._generators = fresh
-        for i in np.flatnonzero(mask).tolist():
-            if seeds[i] is not None:
-                self._generators[i] = fresh[i]
-
     def _fresh_observations(self) -> Observations:
         return np.empty((self.num_envs, self.task.layout.size), dtype=np.float32)
 
     def _info(self) -> dict[str, Any]:
-        rows = self._batch.rows
-        info: dict[str, Any] = {
-            "cost": rows[:, COST].copy(),
-            "episode_cost": rows[:, EPISODE_COST].copy(),
-            "constraint_violation": rows[:, VIOLATED] > 0.0,
-            "constraint_values": rows[:, VALUES : VALUES + self._n_values].copy(),
-            "stage_cost": rows[:, STAGE_COST].copy(),
-            "crashed": rows[:, CRASHED] > 0.0,
-            "clipped_actions": rows[:, CLIPPED].astype(np.int64),
-        }
-        present = np.ones(self.num_envs, dtype=np.bool_)
-        return info | {f"_{key}": present.copy() for key in info}
+        return with_presence(score_infos(self._batch.rows, self._n_values), self.num_envs)
