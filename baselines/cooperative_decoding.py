@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from quad_envs._numba import kernel
 from quad_envs.agent_observations import N_PLAN_STAGE, AgentLayout
 from quad_envs.envs.team_kernel import PLAN_SCALE
+from quad_envs.observations import decode_own
 from quad_envs.parameters import Array
 
 from .policy import Actions, Counts
+from .rows import first_not_finite
 from .tracking import encode_commands
 
 PLANT_SIZE = 16
@@ -98,19 +100,11 @@ def decode_rows(
     n, size = obs.shape
     for j in range(n):
         row, plant = obs[j], plants[j]
-        bad = 0
-        for value in row:  # without a branch, so that it vectorises
-            bad |= 0 if abs(value) < np.inf else 1
-        if bad:
-            for i in range(size):
-                if not abs(row[i]) < np.inf:
-                    return int(j * size + i)
+        bad = first_not_finite(row)
+        if bad >= 0:
+            return int(j * size + bad)
+        decode_own(row, plant, last_commands[j])
         _copy_part(row, starts[_POSITION], plant[:3])
-        for i in range(3):
-            plant[3 + i], plant[9 + i] = row[i], row[7 + i]
-        plant[6], plant[7], plant[8] = row[3], row[4], np.arctan2(np.float64(row[5]), np.float64(row[6]))
-        for i in range(4):
-            plant[12 + i], last_commands[j, i] = row[10 + i], row[14 + i]
         leaders[j, 0] = 1.0 if row[starts[_ROLE]] > 0.5 else 0.0
         _copy_part(row, starts[_PREVIEW], previews[j])
         _copy_part(row, starts[_COMM], comms[j])

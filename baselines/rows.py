@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_envs._numba import inline_kernel
+
 from .policy import N_FALLBACKS, Actions, PolicyState
 
 
@@ -54,6 +56,19 @@ def state_of(state: PolicyState | None, n: int, memory_size: int) -> PolicyState
     if state.worst_iterations.shape[0] != n:
         raise ValueError(f"state has {state.worst_iterations.shape[0]} rows, the observation {n}")
     return state
+
+
+@inline_kernel
+def first_not_finite(row: Actions) -> int:
+    """Index of the first entry of an observation that is not finite, or -1."""
+    bad = 0
+    for value in row:  # without a branch, so that it vectorises
+        bad |= 0 if abs(value) < np.inf else 1
+    if bad:
+        for i in range(row.size):
+            if not abs(row[i]) < np.inf:
+                return i
+    return -1
 
 
 def not_finite(obs: NDArray[Any], index: int, slices: Mapping[str, slice]) -> ValueError:

@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from controllers.controller import Controller, Decision
 from quad_envs._numba import kernel
 from quad_envs.constraints import forces_from_actions
-from quad_envs.observations import N_REFERENCE
+from quad_envs.observations import N_OWN, N_REFERENCE, decode_own
 from quad_envs.parameters import Array
 from quad_envs.tasks import Task
 
 from .policy import N_FALLBACKS, Actions, Counts, PolicyState
-from .rows import as_rows, as_starts, not_finite, state_of
+from .rows import as_rows, as_starts, first_not_finite, not_finite, state_of
 
 _PLANT_SIZE, _N_DISTURBANCE = 16, 6
 
@@ -54,22 +54,13 @@ def _decode(
     starting = 0
     for j in range(n):
         row, plant, window = obs[j], plants[j], windows[j].reshape(-1)
-        bad = 0
-        for value in row:  # without a branch, so that it vectorises
-            bad |= 0 if abs(value) < np.inf else 1
-        if bad:
-            for i in range(size):
-                if not abs(row[i]) < np.inf:
-                    return int(j * size + i)
-        at = 18
+        bad = first_not_finite(row)
+        if bad >= 0:
+            return int(j * size + bad)
+        decode_own(row, plant, lasts[j])
+        at = N_OWN
         for i in range(3):
             plant[i] = row[at + i] if sees_position else 0.0
-            plant[3 + i] = row[i]
-            plant[9 + i] = row[7 + i]
-        plant[6], plant[7], plant[8] = row[3], row[4], np.arctan2(row[5], row[6])
-        for i in range(4):
-            plant[12 + i] = row[10 + i]
-            lasts[j, i] = row[14 + i]
         at += 3 if sees_position else 0
         for i in range(6):
             disturbances[j, i] = row[at + i] if sees_disturbance else 0.0

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .observations import N_OWN, N_REFERENCE
+from .observations import N_OWN, N_REFERENCE, as_observations, vehicle_parts
 from .parameters import Array
 
 # Entries of a comm slot.
@@ -139,30 +139,16 @@ class AgentLayout:
         Raises:
             ValueError: If the last axis has another length.
         """
-        obs = np.asarray(observation, dtype=np.float64)
-        if obs.shape[-1:] != (self.size,):
-            raise ValueError(
-                f"observation must have {self.size} entries on its last axis, got shape {obs.shape}"
-            )
+        obs = as_observations(observation, self.size)
         batch, slices = obs.shape[:-1], self.slices
         part = {name: obs[..., slices[name]].reshape(*batch, *shape) for name, shape in self.shapes.items()}
-        psi = np.arctan2(part["sin_cos_psi"][..., :1], part["sin_cos_psi"][..., 1:])
-        zero = np.zeros((*batch, 6))
-        disturbance = part.get("disturbance", zero)
         return AgentView(
-            V_B=part["V_B"],
-            Theta=np.concatenate([part["phi_theta"], psi], axis=-1),
-            Omega=part["Omega"],
-            F=part["F"],
-            last_command=part["last_command"],
-            position=part.get("position", zero[..., :3]),
-            torque=disturbance[..., :3],
-            force=disturbance[..., 3:],
+            **vehicle_parts(part, batch),
             leader=part["role"][..., 0] > 0.5,
             preview=part["preview"],
             comm=part["comm"],
             sensed=part["sensed"],
             measured=part.get("measured", np.zeros((*batch, 0, N_MEASURED))),
-            slot=part.get("slot", zero[..., :3]),
+            slot=part.get("slot", np.zeros((*batch, 3))),
             estimate=part.get("estimate", np.zeros((*batch, 0, N_ESTIMATE))),
         )

@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -98,26 +99,47 @@ class TrackingLayout:
         Raises:
             ValueError: If the last axis has another length.
         """
-        obs = np.asarray(observation, dtype=np.float64)
-        if obs.shape[-1:] != (self.size,):
-            raise ValueError(
-                f"observation must have {self.size} entries on its last axis, got shape {obs.shape}"
-            )
+        obs = as_observations(observation, self.size)
         part = {name: obs[..., where] for name, where in self.slices.items()}
-        psi = np.arctan2(part["sin_cos_psi"][..., :1], part["sin_cos_psi"][..., 1:])
-        zero = np.zeros((*obs.shape[:-1], 6))
-        disturbance = part.get("disturbance", zero)
+        batch = obs.shape[:-1]
         return TrackingView(
-            V_B=part["V_B"],
-            Theta=np.concatenate([part["phi_theta"], psi], axis=-1),
-            Omega=part["Omega"],
-            F=part["F"],
-            last_command=part["last_command"],
-            position=part.get("position", zero[..., :3]),
-            torque=disturbance[..., :3],
-            force=disturbance[..., 3:],
-            preview=part["preview"].reshape(*obs.shape[:-1], self.preview + 1, N_REFERENCE),
+            **vehicle_parts(part, batch),
+            preview=part["preview"].reshape(*batch, self.preview + 1, N_REFERENCE),
         )
+
+
+def as_observations(observation: NDArray[np.floating], size: int) -> Array:
+    """Observations (..., size) as float64.
+
+    Raises:
+        ValueError: If the last axis has another length.
+    """
+    obs = np.asarray(observation, dtype=np.float64)
+    if obs.shape[-1:] != (size,):
+        raise ValueError(f"observation must have {size} entries on its last axis, got shape {obs.shape}")
+    return obs
+
+
+def vehicle_parts(part: Mapping[str, Array], batch: tuple[int, ...]) -> dict[str, Array]:
+    """What every view begins with, from `V_B` to `force`: yaw as an angle, zero for what is not observed.
+
+    Args:
+        part: Name -> slice of the observations, (*batch, size of the part).
+        batch: Leading axes.
+    """
+    psi = np.arctan2(part["sin_cos_psi"][..., :1], part["sin_cos_psi"][..., 1:])
+    zero = np.zeros((*batch, 6))
+    disturbance = part.get("disturbance", zero)
+    return {
+        "V_B": part["V_B"],
+        "Theta": np.concatenate([part["phi_theta"], psi], axis=-1),
+        "Omega": part["Omega"],
+        "F": part["F"],
+        "last_command": part["last_command"],
+        "position": part.get("position", zero[..., :3]),
+        "torque": disturbance[..., :3],
+        "force": disturbance[..., 3:],
+    }
 
 
 @inline_kernel
@@ -140,6 +162,26 @@ def encode_own(out: NDArray[np.float32], plant: Array, command: Array) -> None:
     for i in range(4):
         out[10 + i] = plant[12 + i]
         out[14 + i] = command[i]
+
+
+@inline_kernel
+def decode_own(row: NDArray[np.float32], plant: Array, command: Array) -> None:
+    """Read the `own` block; the position in the plant is left as it is.
+
+    Args:
+        row: Observation, (>= 18,) float32.
+        plant: Result, [p, V_B, Theta, Omega, F], (16,).
+        command: Result, last rotor commands, (4,), N.
+    """
+    for i in range(3):
+        plant[3 + i] = row[i]
+        plant[9 + i] = row[7 + i]
+    plant[6] = row[3]
+    plant[7] = row[4]
+    plant[8] = np.arctan2(np.float64(row[5]), np.float64(row[6]))
+    for i in range(4):
+        plant[12 + i] = row[10 + i]
+        command[i] = row[14 + i]
 
 
 @inline_kernel
