@@ -14,8 +14,8 @@ from quad_envs.observations import N_REFERENCE
 from quad_envs.parameters import N_INPUT, Array
 from quad_envs.tasks import TeamTask
 
-from .policy import N_FALLBACKS, Actions, PolicyState
-from .rows import as_starts
+from .policy import Actions, PolicyState
+from .rows import as_starts, state_of
 
 
 class CentralMpcPolicy:
@@ -104,11 +104,7 @@ class CentralMpcPolicy:
                 f"{np.shape(observation)}"
             )
         n, start = len(rows), as_starts(episode_start, len(rows))
-        if state is None:
-            fresh, none = np.zeros((n, N_FALLBACKS), dtype=np.int64), np.zeros(n, dtype=np.int64)
-            state = PolicyState(np.zeros((n, self.memory_size)), fresh, none, none)
-        elif len(state.memory) != n:
-            raise ValueError(f"state has {len(state.memory)} rows, the observation {n}")
+        state = state_of(state, n, self.memory_size)
         actions = np.zeros((n, self.task.vehicles, self.task.action_size), dtype=np.float32)
         memory = np.where(start[:, None], 0.0, state.memory)
         fallbacks = np.where(start[:, None], 0, state.fallbacks)

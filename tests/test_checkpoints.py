@@ -13,7 +13,7 @@ import pytest
 from baselines import CheckpointError, check_policy, evaluate, load_policy, make_policy, shipped_policies
 from baselines.environments import make_env, task_of
 from baselines.training import Network, NetworkPolicy, load_checkpoint, save_checkpoint
-from baselines.training.networks import default_features, hover_actions, hover_outputs
+from baselines.training.networks import default_features, hover_actions, hover_outputs, hover_slopes
 
 HELIX, FORMATION = "quad/HelixTracking-v0", "quad/Formation-v0"
 ABOUT = {"env_id": HELIX, "mission": "tracking", "algorithm": "apg", "kind": "model-based", "score": 0.5}
@@ -92,6 +92,14 @@ def test_outputs_and_actions_turn_into_each_other():
     # A third and three times a third in float32.
     assert np.allclose(hover_outputs(hover_actions(outputs, task), task), outputs, atol=1e-6)
     assert hover_outputs(np.ones((1, 4), np.float32), task).max() == 1.0
+
+
+def test_the_slopes_of_the_hover_map_are_its_differences():
+    task, step = task_of(make_env(HELIX, kappa=0.4)), 1e-6  # at kappa 0.4 the box cuts from output 0.6 on
+    outputs = np.array([[-0.9, -0.1, 0.1, 0.5], [0.55, 0.65, 0.9, 1.0]])
+    ahead, behind = hover_actions(outputs + step, task), hover_actions(outputs - step, task)
+    # Piecewise linear: off by rounding alone.
+    assert np.allclose(hover_slopes(outputs, task), (ahead - behind) / (2.0 * step), atol=1e-8)
 
 
 def test_a_network_flies_where_the_layout_has_what_it_sees(saved):

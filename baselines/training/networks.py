@@ -15,10 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 from quad_envs._numba import entry_of
 from quad_envs.agent_observations import AgentLayout
 from quad_envs.observations import N_REFERENCE, TrackingLayout
+from quad_envs.parameters import Array
 from quad_envs.tasks import BaseTask, Task, TeamTask
 
 from ..network_kernels import forward_rows
-from ..policy import N_FALLBACKS, Actions, PolicyState
+from ..policy import Actions, PolicyState
+from ..rows import as_rows, state_of
 
 Floats = NDArray[np.float32]
 Squash = Literal["tanh", "clip"]
@@ -167,6 +169,11 @@ class Network:
         return int(self.weights[-1].shape[1])
 
 
+def _hover_gain(task: BaseTask) -> float:
+    """Slope of `hover_actions` above hover."""
+    return float(task.hover_force / (task.force_max - task.hover_force))
+
+
 def hover_actions(outputs: Floats, task: BaseTask) -> Floats:
     """Actions that command u_T (1 + output) within the rotor box, for the first four outputs.
 
@@ -174,18 +181,22 @@ def hover_actions(outputs: Floats, task: BaseTask) -> Floats:
     whose upper half reaches to kappa m g.
     """
     out = outputs.copy()
-    gain = task.hover_force / (task.force_max - task.hover_force)
     rotors = out[..., :4]
-    np.copyto(rotors, np.minimum(np.where(rotors < 0.0, rotors, gain * rotors), 1.0))
+    np.copyto(rotors, np.minimum(np.where(rotors < 0.0, rotors, _hover_gain(task) * rotors), 1.0))
     return out
+
+
+def hover_slopes(outputs: Floats, task: BaseTask) -> Array:
+    """Derivative of `hover_actions` by each of four outputs; 0 where the rotor box cuts."""
+    gain = _hover_gain(task)
+    return np.where(outputs < 0.0, 1.0, np.where(gain * outputs < 1.0, gain, 0.0))
 
 
 def hover_outputs(actions: Floats, task: BaseTask) -> Floats:
     """The outputs of which `hover_actions` makes these actions, within [-1, 1]."""
     out = actions.copy()
-    gain = task.hover_force / (task.force_max - task.hover_force)
     rotors = out[..., :4]
-    np.copyto(rotors, np.minimum(np.where(rotors < 0.0, rotors, rotors / gain), 1.0))
+    np.copyto(rotors, np.minimum(np.where(rotors < 0.0, rotors, rotors / _hover_gain(task)), 1.0))
     return out
 
 
@@ -223,8 +234,7 @@ class NetworkPolicy:
         self._layers = [first, *zip(network.weights[1:], network.biases[1:], strict=True)]
         self._sizes = np.array([len(self._columns), *(len(b) for _, b in self._layers)], dtype=np.int64)
         self._flat = np.concatenate([part.reshape(-1) for layer in self._layers for part in layer])
-        gain = task.hover_force / (task.force_max - task.hover_force)
-        self._gain = np.float32(gain if network.commands == "hover" else 1.0)
+        self._gain = np.float32(_hover_gain(task) if network.commands == "hover" else 1.0)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.name!r}, {self.task.env_id!r})"
@@ -241,13 +251,7 @@ class NetworkPolicy:
         Raises:
             ValueError: If a shape is wrong or an observation is not finite.
         """
-        obs = np.asarray(observation, dtype=np.float32)
-        one = obs.ndim == 1
-        if one:
-            obs = obs[None]
-        if obs.ndim != 2 or obs.shape[1] != self._size:
-            shape = np.shape(observation)
-            raise ValueError(f"observation must have shape (n, {self._size}) or ({self._size},), got {shape}")
+        obs, one = as_rows(observation, self._size)
         actions = self._few(obs) if len(obs) <= _FEW else self._many(obs)
         return actions[0] if one else actions, _no_state(len(obs))
 
@@ -282,8 +286,7 @@ class NetworkPolicy:
 @lru_cache(maxsize=64)
 def _no_state(n: int) -> PolicyState:
     """The state of a policy that remembers nothing, shared by its calls and so read-only."""
-    memory, fallbacks = np.zeros((n, 0)), np.zeros((n, N_FALLBACKS), dtype=np.int64)
-    count = np.zeros(n, dtype=np.int64)
-    for part in (memory, fallbacks, count):
+    state = state_of(None, n, 0)
+    for part in (state.memory, state.fallbacks, state.iterations, state.worst_iterations):
         part.setflags(write=False)
-    return PolicyState(memory, fallbacks, count, count)
+    return state

@@ -20,7 +20,7 @@ from quad_envs.envs.options import TrackingOptions
 
 from ..errors import TrainingError
 from .flights import DifferentiableFlights
-from .networks import Floats, Network, hover_actions
+from .networks import Floats, Network, hover_actions, hover_slopes
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,14 +95,13 @@ def _window_gradient(
     actor: Actor, flights: DifferentiableFlights, options: PolicyGradientOptions, horizon: int, epsilon: float
 ) -> float:
     """Roll a window out, take it back, leave the gradient in the actor's parameters; the mean reward."""
-    task, gain = flights.task, flights.task.hover_force / (flights.task.force_max - flights.task.hover_force)
     seen, outputs, records = [], [], []
     for _ in range(horizon):
         x = torch.from_numpy(flights.observe()).requires_grad_()
         out = actor(x)
         seen.append(x)
         outputs.append(out)
-        records.append(flights.advance(hover_actions(out.detach().numpy(), task)))
+        records.append(flights.advance(hover_actions(out.detach().numpy(), flights.task)))
     n = flights.n
     plants, commands = np.zeros((n, 16)), np.zeros((n, 4))
     for t in range(horizon - 1, -1, -1):
@@ -112,9 +111,8 @@ def _window_gradient(
         actions, plants, commands = flights.advance_vjp(
             record, plants, commands, rewards, -weight * options.penalty
         )
-        value = out.detach().numpy()
-        slope = np.where(value < 0.0, 1.0, np.where(gain * value < 1.0, gain, 0.0))
-        out.backward(torch.from_numpy((actions * slope).astype(np.float32)))
+        slopes = hover_slopes(out.detach().numpy(), flights.task)
+        out.backward(torch.from_numpy((actions * slopes).astype(np.float32)))
         assert x.grad is not None
         own, last = flights.observe_vjp(record.plants, x.grad.numpy())
         plants, commands = plants + own, commands + last
