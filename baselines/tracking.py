@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from controllers.controller import Controller, Decision
 from quad_envs._numba import kernel
-from quad_envs.constraints import forces_from_actions
+from quad_envs.constraints import action_from_force, forces_from_actions
 from quad_envs.observations import N_OWN, N_REFERENCE, decode_own
 from quad_envs.parameters import Array
 from quad_envs.tasks import Task
@@ -105,8 +105,7 @@ def encode_commands(
     """
     for j in range(commands.shape[0]):
         for i in range(4):
-            change = commands[j, i] - hover
-            actions[j, i] = min(max(change / (hover if change < 0.0 else force_max - hover), -1.0), 1.0)
+            actions[j, i] = action_from_force(commands[j, i], hover, force_max)
         for i in range(N_FALLBACKS):
             new_counts[j, i] = 0 if start[j] else counts[j, i]
         new_counts[j, fallback[j]] += 1

@@ -76,11 +76,17 @@ def force_from_action(action: float, hover: float, force_max: float) -> float:
     return hover + action * (hover if action < 0.0 else force_max - hover)
 
 
+@inline_kernel
+def action_from_force(force: float, hover: float, force_max: float) -> float:
+    """Action entry that commands a rotor force, clipped to [-1, 1]: the inverse of `force_from_action`."""
+    change = force - hover
+    return min(max(change / (hover if change < 0.0 else force_max - hover), -1.0), 1.0)
+
+
 @kernel
 def _actions_from_forces(forces: Array, hover: float, force_max: float, out: NDArray[np.float32]) -> None:
     for i in range(forces.size):
-        change = forces[i] - hover
-        out[i] = min(max(change / (hover if change < 0.0 else force_max - hover), -1.0), 1.0)
+        out[i] = action_from_force(forces[i], hover, force_max)
 
 
 def actions_from_forces(forces: Array, hover: float, force_max: float) -> NDArray[np.float32]:
