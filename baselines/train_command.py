@@ -62,10 +62,18 @@ def train_one(options: TrainOptions) -> int:
 
 def resume_command(options: TrainOptions, out: Path) -> str:
     """The command line that goes on with a run."""
-    words = ["quad-envs train", shlex.quote(options.env), options.algorithm, f"--seed {options.seed}"]
-    words += [] if options.seconds is None else [f"--seconds {options.seconds:g}"]
-    words += [] if options.steps is None else [f"--steps {options.steps}"]
-    words += [f"--out {shlex.quote(str(out))}"]
-    words += [f"--set {shlex.quote(text)}" for text in options.set]
-    words += [f"--hyper {shlex.quote(text)}" for text in options.hyper]
-    return " ".join([*words, "--resume"])
+    from .training.command_line import training_command
+
+    return (
+        training_command(
+            options.env,
+            options.algorithm,
+            options.seed,
+            options.seconds,
+            options.steps,
+            str(out),
+            options.set,
+            options.hyper,
+        )
+        + " --resume"
+    )

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import gymnasium
 import pytest
+from processes import start_command
 
 from baselines.__main__ import COMMANDS, main
 from baselines.commands import _resume
@@ -223,8 +224,7 @@ def test_a_reader_that_leaves_is_no_error():
 def test_ctrl_c_says_how_to_resume_and_exits_with_130(tmp_path):
     out, suite = tmp_path / "run", tmp_path / "long.toml"
     suite.write_text('envs = ["quad/HelixTracking-v0"]\npolicies = ["random", "hover"]\nepisodes = 2000\n')
-    command = [*RUN, "benchmark", str(suite), "--out", str(out)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with start_command("benchmark", suite, "--out", out) as process:
         for _ in range(600):
             if list(out.glob("cells/*.json")):
                 break

@@ -3,12 +3,14 @@
 import csv
 import io
 import json
+import signal
 import time
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import pytest
+from processes import start_command
 
 from baselines import CheckpointError, ResultsError, TrainingError, evaluate, make_policy, train
 from baselines.__main__ import main
@@ -343,6 +345,23 @@ def test_ctrl_c_says_how_to_go_on(tmp_path, capsys):
         TrainOptions(HELIX, "stub", steps=500, hyper=["fails_at=3", "how=interrupt"]), out
     )
     assert said.endswith(command) and command.endswith("--resume") and f"'{out}'" in command
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_a_training_of_the_command_line_and_the_run_goes_on(tmp_path):
+    pytest.importorskip("torch")
+    arguments = ["train", HELIX, "apg", "--seconds", "60", "--out", tmp_path / "run"]
+    with start_command(*arguments) as process:
+        while "score" not in process.stderr.readline():
+            assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        printed, said = process.communicate(timeout=60)
+    assert process.returncode == 130 and printed == "" and "Traceback" not in said
+    assert said.splitlines()[-1].endswith("--resume")
+    load_checkpoint(tmp_path / "run")
+    with start_command(*arguments[:4], "3", *arguments[5:], "--resume") as process:
+        printed, said = process.communicate(timeout=60)
+    assert process.returncode == 0 and printed.startswith("best of") and "policy in" in said
 
 
 def test_a_budget_counts_one_thing():

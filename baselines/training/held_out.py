@@ -6,6 +6,7 @@ that those from 10 000 to 19 999 stay untouched for comparisons.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -38,7 +39,18 @@ class Point(NamedTuple):
     training_reward: float  # mean of the last update, as the algorithm saw it
 
 
-WHOLE = ("steps", "updates", "crashes", "flights")  # fields of a Point that are whole numbers
+def read_point(stored: Mapping[str, Any]) -> Point:
+    """A row as JSON or CSV stored it: nan, the cost of a flight that crashed, is null or empty there.
+
+    Raises:
+        KeyError, TypeError, ValueError: If a field is missing or is no number.
+    """
+    values = {name: math.nan if stored[name] in (None, "") else float(stored[name]) for name in Point._fields}
+    whole: dict[str, Any] = {name: int(values[name]) for name in _WHOLE}
+    return Point(**{**values, **whole})
+
+
+_WHOLE = ("steps", "updates", "crashes", "flights")  # fields of a Point that are whole numbers
 
 
 def training_options(env_id: str, env_kwargs: Mapping[str, Any]) -> Any:

@@ -20,7 +20,7 @@ from typing import Any
 from ..errors import ResultsError
 from ..results import plain_json, provenance, read_json, write_atomic, write_csv
 from .checkpoints import DESCRIPTION, WEIGHTS, load_checkpoint, save_checkpoint
-from .held_out import WHOLE, Point
+from .held_out import Point, read_point
 from .networks import Network
 
 _IDENTITY = ("env_id", "env_kwargs", "algorithm", "seed", "hyperparameters")  # a resumed run must agree
@@ -108,11 +108,10 @@ class RunFolder:
 
     def read_curve(self) -> list[Point]:
         """The curve so far; empty if there is none."""
-        path, points = self.path / "curve.csv", []
+        path = self.path / "curve.csv"
+        points: list[Point] = []
         with suppress(FileNotFoundError, ValueError, TypeError, KeyError), open(path, newline="") as file:
-            for row in csv.DictReader(file):
-                values: dict[str, Any] = {name: float(row[name] or "nan") for name in Point._fields}
-                points.append(Point(**values | {name: int(values[name]) for name in WHOLE}))
+            points.extend(map(read_point, csv.DictReader(file)))
         return points
 
     def write_config(self, commands: Sequence[Any]) -> None:

@@ -6,7 +6,6 @@ Nothing here knows an algorithm: each is a generator, see `algorithms`.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,7 +17,8 @@ from ..policy import mission_of
 from ..results import locked
 from .algorithms import ALGORITHMS, algorithm_for, generator_of, require_packages, resumable
 from .clock import Budget, TrainingClock
-from .held_out import CHOOSING, HeldOutFlights, Point, better, training_options
+from .command_line import assignments, training_command
+from .held_out import CHOOSING, HeldOutFlights, Point, better, read_point, training_options
 from .hyperparameters import hyperparameters, plain_options
 from .networks import Network
 from .run_folder import RunFolder
@@ -113,11 +113,7 @@ def train(
         CheckpointError: If a policy cannot be written or read.
         TrainingError: If training diverges; the last good policies are kept.
     """
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < _SEEDS:
-        raise ValueError(
-            f"seed of a training must be a whole number, 0 to {_SEEDS - 1}, got {seed!r}; later ones are "
-            "held out for evaluation"
-        )
+    _check_seed(seed)
     if resume and fresh:
         raise ValueError("either resume or fresh: a run that is discarded cannot go on")
     kwargs = dict(env_kwargs or {})
@@ -125,16 +121,19 @@ def train(
     entry = algorithm_for(algorithm, mission_of(task_options.make_task()))
     budget = Budget(entry.seconds if seconds is None and steps is None else seconds, steps)
     require_packages(algorithm)
-    options = hyperparameters(algorithm, env_id.removeprefix("quad_envs:"), hyper)
+    env_id = env_id.removeprefix("quad_envs:")
+    options = hyperparameters(algorithm, env_id, hyper)
     path = default_folder(env_id, algorithm, seed) if out is None else Path(out)
+    texts = assignments(kwargs), assignments(hyper or {})
     about = {
-        "env_id": env_id.removeprefix("quad_envs:"),
+        "env_id": env_id,
         "env_kwargs": {key: value if _is_plain(value) else repr(value) for key, value in kwargs.items()},
         "mission": mission_of(task_options.make_task()),
         "algorithm": algorithm,
         "kind": entry.kind,
         "seed": seed,
         "hyperparameters": plain_options(options),
+        "made_by": training_command(env_id, algorithm, seed, budget.seconds, budget.steps, "", *texts),
     }
     held_out = HeldOutFlights(env_id, kwargs)
     with locked(path):
@@ -147,6 +146,14 @@ def train(
         run = _Run(folder, budget, held_out, start, getattr(options, _LIMIT, None), watcher)
         run.go(algorithm, task_options, options, seed)
         return TrainingResult(path, env_id, algorithm, seed, run.best_point(), tuple(run.curve))
+
+
+def _check_seed(seed: Any) -> None:
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < _SEEDS:
+        raise ValueError(
+            f"seed of a training must be a whole number, 0 to {_SEEDS - 1}, got {seed!r}; later ones are "
+            "held out for evaluation"
+        )
 
 
 def _is_plain(value: Any) -> bool:
@@ -173,7 +180,7 @@ def _resume(folder: RunFolder, algorithm: str, budget: Budget) -> _Start:
             int(said["updates"]),
             int(said["resumed"]) + 1,
             tuple(curve),
-            Point(**said["best"]),
+            read_point(said["best"]),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ResultsError(
@@ -317,7 +324,6 @@ class _Run:
             "budget": str(self.budget),
             "resumed": self.start.resumed,
             "best": self.best._asdict(),
-            "command": sys.argv,
         }
 
     def _end(self) -> None:
