@@ -24,7 +24,7 @@ def still(task, outputs=4):
 
 def flights_of(env_id, expert, rows, seed=0, **kwargs):
     options = training_options(env_id, kwargs)
-    return LabelledFlights(options, make_policy(expert, options.make_task()), rows, seed)
+    return LabelledFlights(options, make_policy(expert, options.task), rows, seed)
 
 
 @pytest.mark.parametrize(("env_id", "expert", "rows"), [(HELIX, "lqr", 5), (FORMATION, "consensus-mpc", 12)])

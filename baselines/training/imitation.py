@@ -62,7 +62,7 @@ class LabelledFlights:
         if isinstance(options, TeamOptions):
             self.env: TeamVectorEnv | TrackingVectorEnv = TeamVectorEnv(options, count)
         else:
-            given = {field.name: getattr(options, field.name) for field in fields(options)}
+            given = {field.name: getattr(options, field.name) for field in fields(options) if field.init}
             self.env = TrackingVectorEnv(count, **given)
         self.task: BaseTask = self.env.task
         self.features = default_features(self.env.task.layout)

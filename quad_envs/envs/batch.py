@@ -40,7 +40,7 @@ class TrackingBatch:
     """
 
     def __init__(self, options: TrackingOptions, n: int) -> None:
-        self.options, self.n, self.task = options, n, options.make_task()
+        self.options, self.n, self.task = options, n, options.task
         self.rows: Array = np.zeros((n, ROW_SIZE))
         self._vector = task_vector(self.task, options.substeps, options.lost_distance)
         self._reference: Reference = make_reference(options.reference)

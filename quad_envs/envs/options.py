@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -26,17 +26,22 @@ class TrackingOptions(VehicleOptions):
     start_box: float | tuple[float, ...] = 1.0
     preview: int = 25
     lost_distance: float = 50.0
+    task: Task = field(init=False, repr=False, compare=False)  # made from the rest
 
     def __post_init__(self) -> None:
         VehicleOptions.__post_init__(self)
         self.require_positive("lost_distance")
         self.require_whole("preview", 0)
-        self.make_task()
+        object.__setattr__(self, "task", self._make_task())
         self.start_state()
         make_reference(self.reference)
 
     def make_task(self) -> Task:
         """The value from which policies are built."""
+        return self.task
+
+    def _make_task(self) -> Task:
+        """The task that follows from the options."""
         known = self.task_fields()
         layout = TrackingLayout(
             preview=int(self.preview),
