@@ -126,7 +126,7 @@ def shared_estimates(blocks: Array) -> Estimates:
     """The own estimates in the block of the estimate wrapper.
 
     Args:
-        blocks: (n, 13 (1 + K)).
+        blocks: (n, 13 (1 + K)), or the own ones alone, (n, 13); nan where there is none yet.
     """
     n = len(blocks)
     own = blocks[:, :N_ESTIMATE]

@@ -25,12 +25,12 @@ from quad_envs.envs.team_kernel import ESTIMATE_REACH, ESTIMATE_SPEED
 from quad_envs.parameters import POSITION, Array
 from quad_envs.tasks import TeamTask
 
+from .estimation import shared_estimates
 from .policy import Estimates, PolicyState
 
 # Keys of `info` that become signals under the same names.
 TEAM_INFO = ("formation_error", "min_separation", "messages", "reward_terms")
 WRAPPER_INFO = ("nis", "nis_rows")  # of the estimate wrapper's filter, where the policy has none of its own
-_VECH = (np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2]))  # xx, xy, xz, yy, yz, zz
 
 
 def estimate_signals(
@@ -64,8 +64,7 @@ def estimate_signals(
         "nis": found.nis,
         "nis_rows": found.rows,
     }
-    trilaterated = getattr(found, "trilaterated", None)
-    return out if trilaterated is None else out | {"trilaterated": trilaterated}
+    return out if found.trilaterated is None else out | {"trilaterated": found.trilaterated}
 
 
 def _believed(
@@ -74,14 +73,11 @@ def _believed(
     """Estimates relative to the own vehicles."""
     if isinstance(state, PolicyState) and state.estimates is not None:
         return state.estimates
-    n = len(observations)
-    P, no_nis, no_rows = np.full((n, 6, 6), np.nan), np.full(n, np.nan), np.zeros(n, dtype=np.int64)
     if task.layout.estimate:
         own = task.layout.decode(observations).estimate[:, 0]
-        own = np.where(own[:, :1] > 0.0, own, np.nan)
-        P[:, _VECH[0], _VECH[1]] = P[:, _VECH[1], _VECH[0]] = own[:, 7:]
-        return Estimates(own[:, 1:4], own[:, 4:7], P, no_nis, no_rows)
+        return shared_estimates(np.where(own[:, :1] > 0.0, own, np.nan))
     if task.mission == "estimation":
-        answer = np.clip(np.asarray(actions, dtype=np.float64), -1.0, 1.0)
+        n, answer = len(observations), np.clip(np.asarray(actions, dtype=np.float64), -1.0, 1.0)
+        P, no_nis, no_rows = np.full((n, 6, 6), np.nan), np.full(n, np.nan), np.zeros(n, dtype=np.int64)
         return Estimates(ESTIMATE_REACH * answer[:, :3], ESTIMATE_SPEED * answer[:, 3:], P, no_nis, no_rows)
     return None

@@ -492,16 +492,5 @@ def worst_row(
     if normal.shape[0] == 0:
         return row, slack
     return _worst_state_row(
-        x,
-        normals,
-        normal,
-        stage,
-        row_lower,
-        row_upper,
-        weight,
-        spans,
-        4 * u.shape[0] * u.shape[1],
-        state,
-        row,
-        slack,
+        x, normals, normal, stage, row_lower, row_upper, weight, spans, 4 * u.size, state, row, slack
     )
