@@ -1,4 +1,4 @@
-# make demo   install into .venv and fly every tracking baseline on the helix (needs only Python and pip)
+# make demo   install into .venv, fly every tracking baseline on the helix and write a page of it (needs Python and pip)
 # make test   install the development extras and run ruff, mypy and the tests
 # make slow   the tests that take longer: dissertation tables, other solvers, long flights
 PYTHON ?= python3
@@ -10,6 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 
 demo: $(VENV)/installed
 	$(BIN)/quad-envs benchmark quick --fresh --out runs/demo
+	@echo "Open this page in a browser: $(CURDIR)/runs/demo/report.html"
 
 test: $(VENV)/installed-dev
 	$(BIN)/ruff check .

@@ -15,6 +15,8 @@ from .options import (
     EvaluateOptions,
     ListOptions,
     Parser,
+    ReplayOptions,
+    ReportOptions,
     ReproduceOptions,
     TrainOptions,
     add_options,
@@ -65,6 +67,18 @@ def _reproduce(options: ReproduceOptions) -> int:
     return int(reproduce.run(options.what, options.out, options.json, options.jobs))
 
 
+def _report(options: ReportOptions) -> int:
+    from .report import commands
+
+    return commands.make_page(options)
+
+
+def _replay(options: ReplayOptions) -> int:
+    from .report import commands
+
+    return commands.replay(options)
+
+
 def _doctor(options: DoctorOptions) -> int:
     from . import doctor
 
@@ -77,6 +91,8 @@ COMMANDS: dict[str, Command] = {
     "benchmark": Command(BenchmarkOptions, _benchmark),
     "train": Command(TrainOptions, _train),
     "reproduce": Command(ReproduceOptions, _reproduce),
+    "report": Command(ReportOptions, _report),
+    "replay": Command(ReplayOptions, _replay),
     "doctor": Command(DoctorOptions, _doctor),
 }
 

@@ -13,13 +13,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_envs.tasks import TeamTask
+
 from .comparison import Results
 from .engines import check_engine, run_units
 from .environments import make_env
 from .errors import ResultsError
 from .evaluation import Evaluation, evaluate
 from .policy import is_trained, make_policy, mission_of, policy_entry
+from .report import read_run, render_report
+from .report.folder import task_facts
 from .results import (
+    RESULTS_FORMAT,
     discard,
     locked,
     plain_json,
@@ -34,6 +39,8 @@ from .results import (
 from .rollout import Episode
 from .suite import Suite, Unit, load_suite, suite_units
 
+REPORTED = 2  # flights of each unit that are saved for the report where not all are asked for
+
 
 def fly_unit(unit: Unit) -> dict[str, Any]:
     """Fly one unit; the form in which it is stored in cells/."""
@@ -42,30 +49,50 @@ def fly_unit(unit: Unit) -> dict[str, Any]:
         warnings.simplefilter("ignore", UserWarning)  # said once before the first unit
         env = make_env(unit.env.id, **unit.env.kwargs)
     policy = make_policy(unit.policy.name, env, **unit.policy.kwargs)
-    save = None if unit.episode_folder is None else _saver(unit)
+    save = None if unit.episode_folder is None else _saver(unit, env)
     found = evaluate(policy, env, unit.episodes, unit.seed, on_episode=save)
     env.close()
     seconds = perf_counter() - begin
-    return {"env": unit.env.title, "policy": unit.policy.title, "seconds": seconds, "found": found.to_plain()}
+    return {
+        "env": unit.env.title,
+        "policy": unit.policy.title,
+        "seconds": seconds,
+        "task": task_facts(env.unwrapped.task),
+        "flights_saved": len(unit.episode_files()),
+        "found": found.to_plain(),
+    }
 
 
-def _saver(unit: Unit) -> Callable[[Episode], None]:
-    """Writes each flight to episodes/, as soon as all vehicles of a team have given theirs."""
+def _saver(unit: Unit, env: Any) -> Callable[[Episode], None]:
+    """Writes the flights that are wanted to episodes/, each when all vehicles of a team have given theirs."""
     team: list[Episode] = []
 
     def save(episode: Episode) -> None:
         team.append(episode)
         if len(team) < episode.team_size:
             return
-        arrays: dict[str, Any] = flight_arrays(team)
+        arrays: dict[str, Any] = flight_arrays(team) | _shared_arrays(env)
         team.clear()
         path = unit.episode_file(episode.seed)
-        assert path is not None
+        if path is None:
+            return
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **arrays)
         write_atomic(path, buffer.getvalue())
 
     return save
+
+
+def _shared_arrays(env: Any) -> dict[str, NDArray[Any]]:
+    """What a team has in common in the flight that just ended: the target's rows r, v, and who hears whom.
+
+    `graphs` (M, N, N) are the weights that hold at some step, and `graph_of_step` (T+1,) says which.
+    """
+    task = env.unwrapped.task
+    if not isinstance(task, TeamTask):
+        return {}
+    found = {"graphs": env.unwrapped.graphs.graphs, "graph_of_step": env.unwrapped.graphs.which}
+    return found | ({"target": env.unwrapped.target} if task.layout.target else {})
 
 
 def flight_arrays(team: Sequence[Episode]) -> dict[str, NDArray[Any]]:
@@ -111,15 +138,16 @@ def run_benchmark(
     """Fly every policy of a suite in every environment, from the same starts.
 
     An interrupted run goes on where it stopped when it is called again with the same folder: each finished
-    unit (environment x policy) is stored at once; one whose flights are asked for and were not saved is flown
-    again. Decision times mean something with jobs = 1, or idle cores.
+    unit (environment x policy) is stored at once; one whose flights are all asked for and were not saved is
+    flown again. The folder gets a report.html. Decision times mean something with jobs = 1, or idle cores.
 
     Args:
         suite: Name of a shipped suite, path of a TOML file, mapping, or Suite.
         out: Results folder; None keeps the results in memory only.
         engine: "processes", "ray" or "dask".
         jobs: Units flown at a time, >= 1.
-        save_episodes: Whether to write every flight to out/episodes.
+        save_episodes: Whether to write every flight to out/episodes, and not only the first REPORTED of each
+            unit, which the report shows.
         fresh: Whether to discard what the folder holds of an earlier run.
         on_unit: Called with (finished, all) at the beginning and after each unit.
 
@@ -137,10 +165,11 @@ def run_benchmark(
     _refuse_bad_units(suite)
     hold: AbstractContextManager[None] = nullcontext() if folder is None else locked(folder)
     with hold:
-        units = suite_units(suite, folder / "episodes" if folder is not None and save_episodes else None)
+        episodes = None if folder is None else folder / "episodes"
+        units = suite_units(suite, episodes, suite.episodes if save_episodes else REPORTED)
         if folder is not None and fresh:
             discard(folder)
-        done = _begin(folder, suite, units)
+        done = _begin(folder, suite, units, save_episodes)
         report = on_unit or (lambda finished, total: None)
         report(len(done), len(units))
         for index, cell in run_units(
@@ -154,6 +183,7 @@ def run_benchmark(
         if folder is not None:
             write_csv(folder / "summary.csv", results.summary())
             write_csv(folder / "results.csv", results.rows())
+            write_atomic(folder / "report.html", render_report(read_run(folder)).encode())
     return results
 
 
@@ -174,14 +204,16 @@ def _refuse_bad_units(suite: Suite) -> None:
         env.close()
 
 
-def _begin(folder: Path | None, suite: Suite, units: Sequence[Unit]) -> dict[int, dict[str, Any]]:
+def _begin(
+    folder: Path | None, suite: Suite, units: Sequence[Unit], all_flights: bool
+) -> dict[int, dict[str, Any]]:
     """Write config.json, or check that it is this suite's; the finished units by index."""
     if folder is None:
         return {}
     refuse_foreign(folder)
     config = folder / "config.json"
     if not config.exists():
-        write_json(config, {"suite": plain_json(suite.to_dict()), **provenance()})
+        write_json(config, {"format": RESULTS_FORMAT, "suite": plain_json(suite.to_dict()), **provenance()})
         return {}
     stored, asked = read_json(config), plain_json(suite.to_dict())
     if stored.get("suite") != asked:
@@ -196,12 +228,14 @@ def _begin(folder: Path | None, suite: Suite, units: Sequence[Unit]) -> dict[int
             f"{str(folder)!r} was begun with other sources, revision {stored.get('git_revision')}: their "
             "numbers do not mix; choose another folder, or discard it with fresh=True (--fresh)"
         )
-    return dict(_stored_units(folder, units))
+    return dict(_stored_units(folder, units, all_flights))
 
 
-def _stored_units(folder: Path, units: Sequence[Unit]) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Units that have their cell and every flight that is asked for."""
+def _stored_units(
+    folder: Path, units: Sequence[Unit], all_flights: bool
+) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Units that have their cell and, where all are asked for, every flight."""
     for unit in units:
         path = folder / "cells" / unit.file_name
-        if path.exists() and all(file.exists() for file in unit.episode_files()):
+        if path.exists() and not (all_flights and any(not file.exists() for file in unit.episode_files())):
             yield unit.number, read_json(path)

@@ -157,7 +157,7 @@ def evaluate_one(options: EvaluateOptions) -> int:
                 suite, options.out, save_episodes=options.save_episodes, fresh=options.fresh
             )
         found = results.evaluations[0]
-        say(f"results in {options.out}")
+        _say_where(options.out)
     else:
         with plain_warnings():
             env = make_env(options.env, **env_kwargs)
@@ -203,8 +203,13 @@ def benchmark_suite(options: BenchmarkOptions) -> int:
             say(f"interrupted; {finished} units are stored. Resume with: {_resume(options, out)}")
             return 130
     print(json.dumps(results.to_dict(), indent=1, allow_nan=False) if options.json else results)
-    say(f"results in {out}")
+    _say_where(out)
     return 0
+
+
+def _say_where(out: Path) -> None:
+    say(f"results in {out}")
+    say(f"report: {out / 'report.html'}")
 
 
 def _resume(options: BenchmarkOptions, out: Path) -> str:

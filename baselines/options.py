@@ -14,7 +14,13 @@ Options = TypeVar("Options")
 
 
 # What an option is read as; the others are text.
-_KINDS: dict[Any, type[Any]] = {int: int, int | None: int, float | None: float, Path | None: Path}
+_KINDS: dict[Any, type[Any]] = {
+    int: int,
+    int | None: int,
+    float | None: float,
+    Path: Path,
+    Path | None: Path,
+}
 
 
 class Positional(str):
@@ -44,7 +50,7 @@ class EvaluateOptions:
     json: Annotated[bool, "print JSON"] = False
     out: Annotated[Path | None, "results folder"] = None
     fresh: Annotated[bool, "discard what the results folder holds of an earlier run"] = False
-    save_episodes: Annotated[bool, "save every flight to the results folder"] = False
+    save_episodes: Annotated[bool, "save every flight, not only the first two of the report"] = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +65,7 @@ class BenchmarkOptions:
     jobs: Annotated[int, "units flown at a time; more than one disturbs decision times"] = 1
     fresh: Annotated[bool, "discard what the folder holds of an earlier run"] = False
     json: Annotated[bool, "print JSON"] = False
-    save_episodes: Annotated[bool, "save every flight to the results folder"] = False
+    save_episodes: Annotated[bool, "save every flight, not only the first two of the report"] = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +99,25 @@ class ReproduceOptions:
     jobs: Annotated[int, "processes"] = 1
     json: Annotated[bool, "print JSON"] = False
     out: Annotated[Path | None, "results folder"] = None
+
+
+@dataclass(frozen=True, slots=True)
+class ReportOptions:
+    """Make the page of a results folder again: leaderboard and flights in one file."""
+
+    run: Annotated[Path, Positional("results folder of evaluate or benchmark")]
+    out: Annotated[Path | None, "file of the page; RUN/report.html if not given"] = None
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayOptions:
+    """Open one flight of a results folder in the browser."""
+
+    run: Annotated[Path, Positional("results folder of evaluate or benchmark")]
+    env: Annotated[str, "environment, its id or its label in the suite; the first if not given"] = ""
+    policy: Annotated[str, "policy that is shown; the best and the base if not given"] = ""
+    seed: Annotated[int | None, "environment seed of the flight; the first saved one if not given"] = None
+    out: Annotated[Path | None, "file of the page; RUN/replay.html if not given"] = None
 
 
 @dataclass(frozen=True, slots=True)

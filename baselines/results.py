@@ -2,7 +2,8 @@
 
 config.json        suite, versions, git revision, command
 cells/*.json       one finished unit (environment x policy) each
-episodes/*.npz     flights, if asked for; a team in one file, vehicles first
+episodes/*.npz     the first flights of each unit, or all if asked for; a team in one file, vehicles first
+report.html        the leaderboard and these flights to look at, see `baselines.report`
 results.csv        one row per environment x policy x flight (x vehicle), when all units are finished
 summary.csv        one row per environment x policy
 """
@@ -32,7 +33,8 @@ import quad_envs
 from .errors import ResultsError
 
 _LOCK = ".lock"
-_RESULTS = ("results.csv", "summary.csv", "cells/*.json", "episodes/*.npz")
+_RESULTS = ("results.csv", "summary.csv", "report.html", "replay.html", "cells/*.json", "episodes/*.npz")
+RESULTS_FORMAT = 2  # of the folder; 1 had neither this number nor the tasks in its cells
 _DISTRIBUTIONS = ("gymnasium", "pettingzoo", "numpy", "scipy", "numba", "osqp", "joblib")
 
 

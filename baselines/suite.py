@@ -254,6 +254,7 @@ class Unit(NamedTuple):
     episodes: int
     seed: int
     episode_folder: Path | None  # where to save flights
+    flights_saved: int = 0  # how many, the first ones
 
     @property
     def file_name(self) -> str:
@@ -262,17 +263,21 @@ class Unit(NamedTuple):
         return f"{self.number:03d}-{slug[:80]}.json"
 
     def episode_file(self, seed: int) -> Path | None:
-        """File of the flight with a seed; None if flights are not saved."""
-        stem = self.file_name.removesuffix(".json")
-        return None if self.episode_folder is None else self.episode_folder / f"{stem}-{seed}.npz"
+        """File of the flight with a seed; None if it is not saved."""
+        if self.episode_folder is None or seed >= self.seed + self.flights_saved:
+            return None
+        return self.episode_folder / f"{self.file_name.removesuffix('.json')}-{seed}.npz"
 
     def episode_files(self) -> list[Path]:
-        """Files of all its flights; none if flights are not saved."""
+        """Files of its flights that are saved."""
         files = (self.episode_file(self.seed + i) for i in range(self.episodes))
         return [file for file in files if file is not None]
 
 
-def suite_units(suite: Suite, episode_folder: Path | None = None) -> list[Unit]:
-    """All environments x policies that are for them."""
+def suite_units(suite: Suite, episode_folder: Path | None = None, flights_saved: int = 0) -> list[Unit]:
+    """All environments x policies that are for them; the first `flights_saved` flights go to the folder."""
     pairs = [(env, policy) for env in suite.envs for policy in suite.policies if policy.flies_in(env)]
-    return [Unit(i, *pair, suite.episodes, suite.seed, episode_folder) for i, pair in enumerate(pairs)]
+    return [
+        Unit(i, env, policy, suite.episodes, suite.seed, episode_folder, flights_saved)
+        for i, (env, policy) in enumerate(pairs)
+    ]

@@ -74,7 +74,7 @@ def test_every_policy_flies_in_every_environment_from_the_same_seeds(finished):
 def test_the_folder_holds_configuration_results_summary_and_flights(finished):
     results, folder = finished
     assert sorted(path.name for path in folder.iterdir()) == [
-        ".lock", "cells", "config.json", "episodes", "results.csv", "summary.csv",
+        ".lock", "cells", "config.json", "episodes", "report.html", "results.csv", "summary.csv",
     ]  # fmt: skip
     config = json.loads((folder / "config.json").read_text())
     assert config["suite"]["episodes"] == 3 and "numba" in config["versions"] and "git_revision" in config

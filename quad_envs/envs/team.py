@@ -10,6 +10,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
+from ..graphs import GraphTable
 from ..parameters import Array
 from ..tasks import TeamTask
 from .exchange import ALIVE, CAUSE, HEARD, NEAREST, SLOT_ERROR, TERMINATED, TERMS
@@ -106,6 +107,12 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
     def target(self) -> Array:
         """Rows r, v of the target in this episode, (T+1, 6); zero where there is none. For study."""
         return self._batch.target(0).copy()
+
+    @property
+    def graphs(self) -> GraphTable:
+        """Communication graphs of this episode, and which of them holds at each step. For study."""
+        graphs, which = self._batch.graphs
+        return GraphTable(graphs.copy(), which.copy())
 
     @property
     def senders(self) -> NDArray[np.int64]:

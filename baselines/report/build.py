@@ -1,0 +1,195 @@
+"""From a results folder to the report: leaderboards, and as many flights as a page of 3 MB can hold."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from baselines.errors import ResultsError
+from baselines.evaluation import NO_SPANNING_TREE
+from quad_envs.names import unknown_name
+
+from .flights import BadFlightError, read_flight
+from .folder import Finished, Run
+from .leaderboard import leaderboard
+from .model import PAGE_FORMAT, Environment, Flight, Report
+from .page import render_page
+from .quantise import Blobs
+
+PAGE_BYTES = 2_900_000  # a page stays below 3 MB, its own text included
+_PER_FLIGHT = 1100  # bytes of JSON around a flight's series
+_STRIDES = (1, 2, 4, 8, 16)
+_NOTES = 12  # that are listed one by one
+
+
+class Choice(NamedTuple):
+    """The flight on which a replay opens; what is not chosen is the first there is."""
+
+    env: str = ""  # title in the suite, or its id
+    policy: str = ""  # title; the base and the best if empty
+    seed: int | None = None
+
+
+def render_report(run: Run, choice: Choice | None = None) -> str:
+    """The page of a run; see `build_report`."""
+    return render_page(build_report(run, choice))
+
+
+def build_report(run: Run, choice: Choice | None = None) -> Report:
+    """All that the page shows.
+
+    Flights stand in it environment by environment and start by start, those of all policies together. If not
+    even the first start of each environment fits, their rows are thinned out; the notes say so.
+
+    Args:
+        run: The folder.
+        choice: To show one start of one environment only, and to begin with it.
+
+    Raises:
+        ResultsError: If what is chosen is not there.
+    """
+    environments = run.environments()
+    wanted = None if choice is None else _resolve(run, choice)
+    if wanted is not None:
+        environments = [entry for entry in environments if entry[0].title == wanted["env"]]
+    shelf = _Shelf(PAGE_BYTES - 150_000)  # the rest is for the page's own text and the leaderboards
+    units = [here for _, _, here in environments]
+    flights, left_out = shelf.fill(units, None if wanted is None else wanted["seed"])
+    shown = []
+    for (env, results, here), found in zip(environments, flights, strict=True):
+        columns, rows = leaderboard(results.summary(), results.base_of(env.title))
+        trees = [one.evaluation.spanning_tree for one in here]
+        note = NO_SPANNING_TREE if False in trees else ""
+        base = results.base_of(env.title)
+        facts = here[0].task
+        shown.append(
+            Environment(env.title, env.id, env.kwargs, facts, base, note, columns, rows, tuple(found))
+        )
+    notes = (*_notes_of_run(run), *shelf.notes(left_out))
+    return Report(
+        PAGE_FORMAT, run.suite.name, _provenance(run), notes, tuple(shown), shelf.blobs.texts(), wanted
+    )
+
+
+class _Shelf:
+    """Takes flights until the page is full."""
+
+    def __init__(self, room: int) -> None:
+        self.room, self.blobs, self.stride, self.bad = room, Blobs(), 1, dict[str, None]()
+        self.count = 0
+
+    def fill(
+        self, environments: Sequence[Sequence[Finished]], seed: int | None
+    ) -> tuple[list[list[Flight]], int]:
+        """Flights of each environment, and how many saved ones did not fit."""
+        starts = [_starts(here) if seed is None else [seed] for here in environments]
+        for self.stride in _STRIDES:
+            self.blobs, self.count = Blobs(), 0
+            flights = [
+                list(self._read(here, start[:1])) for here, start in zip(environments, starts, strict=True)
+            ]
+            if self._used() <= self.room:
+                break
+        left_out, full = 0, False
+        for rank in range(1, max(map(len, starts), default=0)):
+            for here, start, found in zip(environments, starts, flights, strict=True):
+                before, count = len(self.blobs.texts()), self.count
+                if rank >= len(start):
+                    continue
+                more = [] if full else list(self._read(here, start[rank : rank + 1]))
+                if self._used() > self.room:
+                    self.blobs.forget_after(before)
+                    full, self.count, more = True, count, []
+                left_out += sum(start[rank] in dict(one.flights()) for one in here) if full else 0
+                found += more
+        return flights, left_out
+
+    def _used(self) -> int:
+        return self.blobs.size + self.count * _PER_FLIGHT
+
+    def _read(self, here: Iterable[Finished], seeds: Sequence[int]) -> Iterator[Flight]:
+        """Flights of all policies from these starts; what cannot be read is noted."""
+        for one in here:
+            saved = dict(one.flights())
+            for seed in seeds:
+                path = one.unit.episode_file(seed)
+                if seed not in saved or path is None:
+                    continue
+                try:
+                    yield read_flight(
+                        path, one.unit.policy.title, saved[seed], one.task, self.blobs, self.stride
+                    )
+                    self.count += 1
+                except BadFlightError as error:
+                    self.bad[str(error)] = None
+
+    def notes(self, left_out: int) -> list[str]:
+        """What was left out, in words."""
+        bad, out = list(self.bad), []
+        if self.stride > 1:
+            out.append(f"Of the flights one sample in {self.stride} is shown, to keep this page small.")
+        if left_out:
+            out.append(
+                f"{left_out} more saved flights are not in this page, to keep it small; "
+                "quad-envs replay RUN --env ENV --seed N shows any of them."
+            )
+        out += bad[:_NOTES]
+        if len(bad) > _NOTES:
+            out.append(f"{len(bad) - _NOTES} more flights are missing or damaged.")
+        return out
+
+
+def _starts(here: Sequence[Finished]) -> list[int]:
+    """Seeds of which some policy has saved its flight."""
+    return sorted({seed for one in here for seed, _ in one.flights()})
+
+
+def _resolve(run: Run, choice: Choice) -> dict[str, Any]:
+    """The chosen flight, with everything that was left open."""
+    found = run.environments()
+    names = [env.title for env, _, _ in found]
+    matching = [entry for entry in found if choice.env in ("", entry[0].title, entry[0].id)]
+    if not matching:
+        raise ResultsError(unknown_name("environment of this run", choice.env, names))
+    env, _, here = next((entry for entry in matching if _starts(entry[2])), matching[0])
+    seeds = _starts(here)
+    seed = choice.seed if choice.seed is not None else (seeds[0] if seeds else run.suite.seed)
+    if seed not in seeds:
+        known = ", ".join(map(str, seeds[:10])) + (", ..." if len(seeds) > 10 else "")
+        raise ResultsError(
+            f"no flight with seed {seed} is saved in {env.title!r}; saved are: {known or 'none'}. "
+            "--save-episodes saves all"
+        )
+    policies = [one.unit.policy.title for one in here]
+    if choice.policy and choice.policy not in policies:
+        raise ResultsError(unknown_name(f"policy in {env.title!r}:", choice.policy, policies))
+    return {"env": env.title, "seed": seed, "policy": choice.policy or None}
+
+
+def _notes_of_run(run: Run) -> list[str]:
+    done = len(run.finished)
+    if done == run.units:
+        return []
+    return [f"This run is not complete: {done} of {run.units} units (environment x policy) are finished."]
+
+
+def _provenance(run: Run) -> dict[str, Any]:
+    """What one needs to repeat the run."""
+    config, suite = run.config, run.suite
+    words = [str(word) for word in config.get("command", ())]
+    if words and Path(words[0]).name in ("__main__.py", "quad-envs"):
+        words[0] = "quad-envs"
+    revision = config.get("git_revision")
+    versions = config.get("versions")
+    return {
+        "command": shlex.join(words),
+        "versions": dict(versions) if isinstance(versions, Mapping) else {},
+        "revision": revision if isinstance(revision, str) else None,
+        "platform": str(config.get("platform", "")),
+        "first_seed": suite.seed,
+        "last_seed": suite.seed + suite.episodes - 1,
+        "episodes": suite.episodes,
+        "policies": {policy.title: {"name": policy.name, **policy.kwargs} for policy in suite.policies},
+    }
