@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -253,6 +254,15 @@ def test_options_of_every_policy_are_known():
     for name in TEAM_POLICIES:
         assert isinstance(policy_options(name), dict)
     assert policy_options("consensus-mpc")["horizon"] == 5
+
+
+@pytest.mark.parametrize(
+    ("name", "own"), [("consensus-mpc", {}), ("cooperative-mpc", {"reach", "q", "estimates"})]
+)
+def test_the_options_of_a_policy_have_the_defaults_of_its_controller(name, own):
+    of_controller = inspect.signature(CooperativeMpc).parameters
+    for option, default in policy_options(name).items():
+        assert option in own or default == of_controller[option].default
 
 
 def test_a_mission_is_that_of_the_task():

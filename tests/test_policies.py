@@ -121,6 +121,14 @@ def test_a_wrapper_that_changes_the_action_box_is_refused():
         make_policy("hover", RescaleAction(gymnasium.make(HELIX), np.float32(0.0), np.float32(1.0)))
 
 
+def test_an_option_that_mpcs_share_has_one_default():
+    linear, *others = (policy_options(name) for name in ("lmpc", "sdc-nmpc", "nmpc"))
+    for other in others:
+        shared = (linear.keys() & other.keys()) - {"velocity_reference"}  # lmpc alone gains by "attitude"
+        assert len(shared) == 8
+        assert [linear[name] for name in shared] == [other[name] for name in shared]
+
+
 @pytest.mark.parametrize("kwargs", [{}, RICH], ids=["plain", "rich"])
 def test_the_controller_is_given_what_the_layout_decodes(kwargs):
     task = gymnasium.make(HELIX, **kwargs).unwrapped.task
@@ -130,7 +138,7 @@ def test_the_controller_is_given_what_the_layout_decodes(kwargs):
     plant, window, last, disturbance, _ = controller.given
     view = task.layout.decode(obs)
     expected = np.concatenate([view.position, view.V_B, view.Theta, view.Omega, view.F], axis=1)
-    np.testing.assert_allclose(plant, expected, rtol=0, atol=1e-6)  # arctan2 of float32 against float64
+    np.testing.assert_allclose(plant, expected, rtol=0, atol=1e-15)  # arctan2 of two libraries
     stages = view.preview[:, : controller.horizon + 1].copy()
     stages[..., :3] += view.position[:, None]
     np.testing.assert_array_equal(window, stages)
