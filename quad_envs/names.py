@@ -14,7 +14,12 @@ def nearest_name(name: object, known: Iterable[str]) -> str | None:
 
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> str:
     """An error message with the nearest known name, if there is one, and all of them."""
+    return f"unknown {kind} {name!r}; {suggestion(name, known)}"
+
+
+def suggestion(name: object, known: Iterable[str]) -> str:
+    """The nearest known name, if there is one, and all of them."""
     names = list(known)
     near = nearest_name(name, names)
     hint = "" if near is None else f"did you mean {near!r}? "
-    return f"unknown {kind} {name!r}; {hint}known: {', '.join(names) if names else 'none'}"
+    return f"{hint}known: {', '.join(names) if names else 'none'}"

@@ -11,6 +11,7 @@ from .parameters import Limits, QuadrotorParams, Weights
 
 _Triple = tuple[float, float, float]
 LOSS_PARTS = ("position", "velocity", "attitude", "rates", "effort", "formation")  # of the stage cost
+CRASH_CAUSES = ("", "distance", "tilt", "arena", "not finite")
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +82,11 @@ class TeamTask(BaseTask):
     def reward_term_names(self) -> tuple[str, ...]:
         """Names of the entries of `info["reward_terms"]`."""
         return (*LOSS_PARTS, *self.constraint_names)
+
+    @property
+    def crash_causes(self) -> tuple[str, ...]:
+        """Names of the values of `info["crash_cause"]`, a number because TorchRL makes tensors of infos."""
+        return CRASH_CAUSES
 
     @property
     def action_size(self) -> int:

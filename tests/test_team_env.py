@@ -166,13 +166,29 @@ def test_a_crash_ends_the_episode_of_the_whole_team_and_rewards_nobody():
 def test_a_crash_says_who_and_why():
     for terminate in ("team", "agent"):
         env, (_, _, _, _, infos) = collide(terminate)
-        assert [info["crash_cause"] for info in infos.values()] == ["", "distance", "distance", "", "", ""]
+        causes = [env.task.crash_causes[info["crash_cause"]] for info in infos.values()]
+        assert causes == ["", "distance", "distance", "", "", ""]
     env, state = formation_v0.parallel_env(vehicles=2, graph="chain"), np.zeros((2, 12))
     state[1, 1], state[0, 9] = 5.0, 40.0
     env.reset(options={"state": state})
     *_, infos = env.step({name: np.zeros(4, np.float32) for name in env.agents})
-    assert infos["quad_0"]["crash_cause"] == "tilt" and infos["quad_1"]["crash_cause"] == ""
+    causes = [env.task.crash_causes[infos[name]["crash_cause"]] for name in ("quad_0", "quad_1")]
+    assert causes == ["tilt", ""]
     assert all(info["crashed"] for info in infos.values()), "the episode of both ended in a crash"
+
+
+@pytest.mark.parametrize("module", MODULES, ids=names)
+def test_infos_hold_numbers_alone_so_that_clients_can_make_tensors_of_them(module):
+    _, infos = module.parallel_env().reset(seed=0)
+    for key, value in infos["quad_1"].items():
+        assert np.asarray(value).dtype.kind in "bif", key
+
+
+def test_a_step_without_actions_after_the_end_gives_nothing_as_in_pettingzoos_environments():
+    env, _ = collide("team")
+    assert env.step({}) == ({}, {}, {}, {}, {})
+    with pytest.raises(ValueError, match="call reset"):
+        formation_v0.parallel_env().step({})
 
 
 def test_the_cost_of_the_crash_counts():
@@ -278,8 +294,7 @@ def test_a_batch_of_teams_equals_single_teams(module, kwargs):
             for given, ours in zip(said, (rewards, terminated, truncated), strict=True):
                 assert ours[rows].tolist() == list(given.values())
             for key in infos[next(iter(infos))]:
-                numbers = key != "crash_cause"
-                assert np.array_equal(info[key][rows], column(infos, key), equal_nan=numbers)
+                assert np.array_equal(info[key][rows], column(infos, key), equal_nan=True)
 
 
 def test_a_masked_reset_begins_only_its_teams_anew():

@@ -274,7 +274,7 @@ def test_quadratic_reward_is_minus_cost_and_penalty():
 @pytest.mark.parametrize(
     ("kwargs", "error", "message"),
     [
-        ({"kapa": 0.5}, TypeError, "did you mean 'kappa'"),
+        ({"kapa": 0.5}, TypeError, "unexpected keyword argument 'kapa' of .*did you mean 'kappa'"),
         ({"kappa": 0.2}, ValueError, "kappa"),
         ({"kappa": "abc"}, ValueError, "kappa must be a number, got 'abc'"),
         ({"dt": -1.0}, ValueError, "dt"),

@@ -39,10 +39,11 @@ class FormationEnv(TeamEnv):
     ## Info
     Of each agent, at every step and at reset: the keys of the tracking tasks (`cost`, `episode_cost`,
     `constraint_violation`, `constraint_values`, `stage_cost`, `crashed`, `clipped_actions`), and
-    `crash_cause` ("distance", "tilt", "arena", "not finite" for who crashed, else ""; `crashed` is for all
-    whose episode it ends), `formation_error` (m, distance to the slot), `min_separation` (m, smallest
-    distance to another vehicle over the substeps; 2 arena when nobody else flies), `messages` (received in
-    this step), `reward_terms` (parts of l, then violation / scale of each limit: `task.reward_term_names`).
+    `crash_cause` (place in `task.crash_causes`: 1 "distance", 2 "tilt", 3 "arena", 4 "not finite" for who
+    crashed, else 0; `crashed` is for all whose episode it ends), `formation_error` (m, distance to the slot),
+    `min_separation` (m, smallest distance to another vehicle over the substeps; 2 arena when nobody else
+    flies), `messages` (received in this step), `reward_terms` (parts of l, then violation / scale of each
+    limit: `task.reward_term_names`).
 
     ## Arguments
     Vehicle, limits, weights, uncertainty, `dt`, `substeps`, `reward`: see `TrackingEnv`; `tilt_limit` 1.2.

@@ -30,7 +30,7 @@ from .kernel import (
 from .pictures import NO_RENDERING, TeamPictures, checked_rendering
 from .team_batch import TeamBatch
 from .team_options import TeamOptions
-from .team_scores import CRASH_CAUSES, N_LOSS
+from .team_scores import N_LOSS
 
 Observation = NDArray[np.float32]
 Named = dict[str, Any]
@@ -156,8 +156,13 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
     def step(
         self, actions: dict[str, NDArray[np.float32]]
     ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, Named]]:
-        """Hold the rotor commands of all agents over one control period."""
+        """Hold the rotor commands of all agents over one control period.
+
+        After the end of an episode `step({})` answers with nothing, as PettingZoo's environments do.
+        """
         agents = self.agents
+        if not agents and actions == {} and self.np_random is not None:
+            return {}, {}, {}, {}, {}
         observations = self._fresh_observations()
         stacked = self._stack(actions)
         self._batch.step(stacked, observations)
@@ -249,7 +254,7 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
                 "constraint_values": values,
                 "stage_cost": loss,
                 "crashed": crashed > 0.0,
-                "crash_cause": CRASH_CAUSES[int(cause)],
+                "crash_cause": int(cause),
                 "clipped_actions": int(clipped),
                 "formation_error": error,
                 "min_separation": nearest,

@@ -50,8 +50,7 @@ from .kernel import (
 )
 
 N_LOSS = len(LOSS_PARTS)
-CRASH_CAUSES = ("", "distance", "tilt", "arena", "not finite")
-_DISTANCE, _TILT, _ARENA, _NOT_FINITE = range(1, 5)
+_DISTANCE, _TILT, _ARENA, _NOT_FINITE = range(1, 5)  # places in `tasks.CRASH_CAUSES`
 
 
 @kernel

@@ -18,7 +18,7 @@ from .exchange import ALIVE, CAUSE, HEARD, NEAREST, SLOT_ERROR, TERMINATED, TERM
 from .kernel import PLANT, REWARD, TRUNCATED
 from .team_batch import TeamBatch
 from .team_options import TeamOptions
-from .team_scores import CRASH_CAUSES, N_LOSS
+from .team_scores import N_LOSS
 from .vector_parts import Generators, score_infos, seeded, with_presence
 
 Observations = NDArray[np.float32]
@@ -162,7 +162,7 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
     def _info(self) -> dict[str, Any]:
         rows, n = self._batch.rows, len(self.task.constraint_names)
         info = score_infos(rows, n) | {
-            "crash_cause": np.array(CRASH_CAUSES)[rows[:, CAUSE].astype(np.int64)],
+            "crash_cause": rows[:, CAUSE].astype(np.int64),
             "formation_error": rows[:, SLOT_ERROR].copy(),
             "min_separation": rows[:, NEAREST].copy(),
             "messages": rows[:, HEARD].astype(np.int64),

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 
 from ..disturbances import Disturbance, make_disturbance
-from ..names import unknown_name
+from ..names import suggestion
 from ..parameters import N_STATE, Limits, QuadrotorParams, Weights
 
 # Arguments that are one number; what it may be is checked where it is used.
@@ -121,7 +121,9 @@ class VehicleOptions:
         for name in kwargs:
             if name not in known:
                 known.remove("env_id")
-                raise TypeError(unknown_name(f"keyword argument of {cls.kind} environment", name, known))
+                # Python's own words first: TorchRL's GymEnv tries `frameskip` and looks for them.
+                hint = suggestion(name, known)
+                raise TypeError(f"unexpected keyword argument {name!r} of {cls.kind} environment; {hint}")
         return cls(**{name: _as_tuple(value) for name, value in kwargs.items()})
 
     @property
