@@ -85,6 +85,46 @@ def test_who_cannot_be_imitated_is_refused(name, env_id, message):
         make_expert(name, task_of(env_id))
 
 
+def test_an_expert_keeps_the_distance_that_it_is_told():
+    env = make_env(FORMATION, vehicles=2, formation=((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)), graph="chain")
+    experts = make_expert("", env.task), make_expert("", env.task, 0.9)
+    plants = np.zeros((2, 12))
+    plants[1, 1], plants[1, 4] = -0.95, 2.0  # on its way through the leader, who is told to move
+    observations, _ = env.reset(seed=0, options={"state": plants})
+    rows = np.stack(list(observations.values()))
+    near, far = (expert.predict(rows)[0] for expert in experts)
+    assert np.abs(near - far).max() > 0.05
+
+
+@pytest.mark.parametrize(("env_id", "separation"), [(HELIX, 0.5), (FORMATION, 0.3)])
+def test_a_distance_without_a_team_or_below_its_own_is_refused(env_id, separation):
+    with pytest.raises(ValueError, match=r"separation is for teams, and at least their own, got 0\.\d m"):
+        make_expert("", task_of(env_id), separation)
+
+
+def test_networks_do_not_see_slots_that_nobody_fills():
+    options = training_options(FORMATION, {"formation": "hexagon"})  # each hears one other
+    flights = LabelledFlights(options, make_policy("hover", options.make_task()), 12, 0, (0, 2))
+    names = flights.features.names
+    assert {name.split("]")[0] for name in names if name.startswith("comm")} == {"comm[0"}
+    assert {name.split("]")[0] for name in names if name.startswith("preview")} == {"preview[0", "preview[2"}
+    seen = [name for name in default_features(options.task.layout, (0, 2)).names if name not in names]
+    assert seen == [f"comm[{k}][{i}]" for k in range(1, 5) for i in range(15)]
+
+
+def test_ppo_goes_on_from_what_imitated():
+    pytest.importorskip("stable_baselines3")
+    from baselines.training.sb3 import PpoOptions, train_ppo
+
+    options, steps = training_options(FORMATION, {"vehicles": 3, "formation": "triangle"}), iter([0.0, 1.0])
+    small = DaggerOptions(rows=6, window=3, fits=1, final_fits=1, hidden=(8,), squash="clip", stages=(0, 2))
+    ((_, start),) = dagger(options, small, 0, lambda: next(steps))
+    given = PpoOptions(rows=6, horizon=8, batch=64, epochs=1, hidden=(8,), stages=(0, 2), critic_updates=1)
+    _, network = next(train_ppo(options, given, 0, lambda: 0.0, start))
+    np.testing.assert_array_equal(network.weights[0], start.weights[0])
+    assert network.features == start.features and network.squash == "clip"
+
+
 @pytest.mark.parametrize(
     ("algorithm", "options"),
     [

@@ -7,14 +7,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 pytest.importorskip("stable_baselines3")
+
+import torch
 
 from baselines.environments import make_env
 from baselines.errors import TrainingError
 from baselines.evaluation import evaluate
-from baselines.training.lagrangian import LagrangianEnv, Multiplier
-from baselines.training.learner import Tanh
+from baselines.training.lagrangian import (
+    CostCritic,
+    LagrangianBuffer,
+    LagrangianEnv,
+    Multiplier,
+    Probe,
+    cost_advantages,
+)
+from baselines.training.learner import RowBuffer, Tanh
 from baselines.training.networks import NetworkPolicy, hover_actions
 from baselines.training.sb3 import (
     PpoLagrangianOptions,
@@ -203,25 +213,92 @@ def test_a_limit_of_zero_is_refused():
         Multiplier(0.0, 1.0, 1.0)
 
 
-def test_violating_steps_and_crashes_pay():
-    options = TrackingOptions.from_kwargs(TRACKING["quad/CorridorTracking-v0"])
-    multiplier = Multiplier(0.1, 0.0, 3.0)
-    multiplier.update(1.0)
-    plain, flights = (TrainingVecEnv(options, 32, 0) for _ in range(2))
-    env, crashes = LagrangianEnv(flights, multiplier), 0
+def corridor(rows, seed=0):
+    return TrainingVecEnv(TrackingOptions.from_kwargs(TRACKING["quad/CorridorTracking-v0"]), rows, seed)
+
+
+def test_violating_steps_and_crashes_cost_and_rewards_stay_what_they_are():
+    plain, env, crashes = corridor(32), LagrangianEnv(corridor(32), 0.95), 0
     plain.reset()
     env.reset()
-    for _ in range(80):
+    for step in range(80):
         outputs = np.full((32, 4), -0.9, dtype=np.float32)  # all fall
         _, rewards, dones, infos = plain.step(outputs)
-        _, penalised, _, _ = env.step(outputs)
-        crashed = [i for i in np.flatnonzero(dones) if not infos[i]["TimeLimit.truncated"]]
-        others = np.setdiff1d(np.arange(32), crashed)
-        expected = (rewards - 3.0 * plain.violated) / 4.0
-        np.testing.assert_allclose(penalised[others], expected[others], rtol=1e-6, atol=1e-9)
-        np.testing.assert_allclose(penalised[crashed], -3.0 / 4.0, rtol=1e-6)
-        crashes += len(crashed)
-    assert crashes > 0
+        _, same, _, _ = env.step(outputs)
+        np.testing.assert_array_equal(same, rewards)
+        crashed = np.array([done and not infos[i]["TimeLimit.truncated"] for i, done in enumerate(dones)])
+        # A crash counts as violating for ever after: 1 / (1 - 0.95).
+        np.testing.assert_allclose(env.costs[-1], np.where(crashed, 20.0, plain.violated), rtol=1e-6)
+        cut = [row for at, row, _ in env.truncations if at == step]
+        assert cut == np.flatnonzero(dones & ~crashed).tolist()
+        crashes += crashed.sum()
+    assert crashes > 0 and env.truncations
+
+
+def test_advantages_of_costs_are_those_of_stable_baselines3():
+    rng = np.random.default_rng(0)
+    T, rows, gamma, trace = 12, 5, 0.97, 0.9
+    buffer = RowBuffer(
+        T, spaces.Box(-1, 1, (2,)), spaces.Box(-1, 1, (1,)), gae_lambda=trace, gamma=gamma, n_envs=rows
+    )
+    last, dones = torch.from_numpy(rng.random(rows).astype(np.float32)), rng.random(rows) < 0.3
+    buffer.rewards[:], buffer.values[:] = rng.random((2, T, rows))
+    buffer.episode_starts[:] = rng.random((T, rows)) < 0.2
+    buffer.compute_returns_and_advantage(last, dones)
+    ours = cost_advantages(
+        buffer.rewards, buffer.values, last.numpy(), buffer.episode_starts, dones, gamma, trace
+    )
+    np.testing.assert_allclose(ours, buffer.advantages, rtol=1e-5, atol=1e-6)  # float32
+
+
+@pytest.mark.parametrize("m", [0.0, 3.0])
+def test_the_policy_follows_rewards_less_what_violations_cost(m):
+    env, multiplier = LagrangianEnv(corridor(4), 0.95), Multiplier(0.1, 0.0, 1.0)
+    multiplier.value = m
+    box = spaces.Box(-1, 1, (env.observation_space.shape[0],)), spaces.Box(-1, 1, (4,))
+    plain = RowBuffer(3, *box, gae_lambda=0.9, gamma=0.95, n_envs=4)
+    paying = LagrangianBuffer(
+        3, *box, gae_lambda=0.9, gamma=0.95, n_envs=4, env=env, multiplier=multiplier, epochs=0
+    )
+    features, zeros = env.reset(), torch.zeros(4)
+    for buffer in (plain, paying):
+        buffer.reset()
+    for _ in range(3):
+        seen = features
+        features, rewards, dones, _ = env.step(np.full((4, 4), -0.9, dtype=np.float32))
+        for buffer in (plain, paying):
+            buffer.add(seen, np.zeros((4, 4)), rewards, np.zeros(4), zeros, zeros)
+    plain.compute_returns_and_advantage(zeros, dones)
+    values, last = paying.critic(plain.observations), paying.critic(features)
+    costs = cost_advantages(np.stack(env.costs), values, last, plain.episode_starts, dones, 0.95, 0.9)
+    assert not env.truncations and np.abs(costs).min() > 0.0
+    paying.compute_returns_and_advantage(zeros, dones)
+    np.testing.assert_allclose(
+        paying.advantages, (plain.advantages - m * costs) / (1.0 + m), rtol=1e-5, atol=1e-6
+    )
+
+
+def test_a_critic_of_costs_learns_what_follows():
+    torch.manual_seed(0)
+    rng = np.random.default_rng(0)
+    features = rng.normal(size=(2048, 3)).astype(np.float32)
+    returns = 2.0 + features[:, 0]
+    critic = CostCritic(3)
+    critic.fit(features, returns, 400)
+    assert np.abs(critic(features) - returns).mean() < 0.1  # of a standard deviation of 1
+
+
+def test_violations_are_measured_without_the_noise_of_training():
+    task = TrackingOptions.from_kwargs(TRACKING["quad/CorridorTracking-v0"])
+    options = replace(SMALL, log_std=0.0)
+    model = make_ppo(make_flights(task, options, 0), options, 0, lambda: 0.0)
+    # A new network hovers without noise, which keeps the rate limit; with noise nothing does.
+    assert Probe(corridor(16, 1)).share(model, 10) < 0.5
+    noisy = corridor(16, 1)
+    features = noisy.reset()
+    for _ in range(10):
+        features = noisy.step(model.predict(features)[0])[0]
+    assert noisy.tally().violation_share > 0.9
 
 
 def test_the_multiplier_rests_while_training_is_free(monkeypatch):
@@ -239,8 +316,6 @@ def test_the_multiplier_rests_while_training_is_free(monkeypatch):
 
 
 def test_numpy_tanh_has_the_values_and_gradients_of_torch():
-    import torch
-
     x = torch.linspace(-4.0, 4.0, 101, requires_grad=True)
     y = torch.linspace(-4.0, 4.0, 101, requires_grad=True)
     weights = torch.linspace(-1.0, 2.0, 101)

@@ -8,7 +8,7 @@ observation shows cannot be imitated by a network that remembers nothing.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -22,7 +22,8 @@ from quad_envs.tasks import BaseTask, TeamTask
 from ..errors import TrainingError
 from ..policy import Policy, make_policy, mission_of
 from ..rollout import is_privileged
-from .networks import Floats, Network, NetworkPolicy, default_features, hover_outputs
+from .features import training_features
+from .networks import Floats, Network, NetworkPolicy, Squash, hover_outputs
 from .policy_gradient import Actor, Progress
 
 _EXPERTS = {"tracking": "sdc-nmpc", "formation": "consensus-mpc"}
@@ -44,6 +45,10 @@ class DaggerOptions:
     final_rate: float = 0.02  # share of the learning rate at the end of the budget
     threshold: float = 0.05  # of an output's error, up to which the loss is quadratic
     hidden: tuple[int, ...] = (64, 64)
+    squash: Squash = "tanh"  # how outputs come into [-1, 1]; "clip" as PPO, which can then go on from here
+    stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for the usual ones
+    separation: float | None = None  # m, that the expert of a team keeps; None for the task's own
+    episode_steps: int | None = None  # of a team's flight in training; None for the task's own
 
 
 class LabelledFlights:
@@ -54,9 +59,17 @@ class LabelledFlights:
         expert: Decides from observations.
         rows: Number of flights, or of vehicles in as many teams as that makes.
         seed: Of the starts, and of who flies.
+        stages: Of the preview that the network sees; None for the usual ones.
     """
 
-    def __init__(self, options: TrackingOptions | TeamOptions, expert: Policy, rows: int, seed: int) -> None:
+    def __init__(
+        self,
+        options: TrackingOptions | TeamOptions,
+        expert: Policy,
+        rows: int,
+        seed: int,
+        stages: tuple[int, ...] | None = None,
+    ) -> None:
         self._size = options.vehicles if isinstance(options, TeamOptions) else 1
         count = max(1, rows // self._size)
         if isinstance(options, TeamOptions):
@@ -65,7 +78,7 @@ class LabelledFlights:
             given = {field.name: getattr(options, field.name) for field in fields(options) if field.init}
             self.env = TrackingVectorEnv(count, **given)
         self.task: BaseTask = self.env.task
-        self.features = default_features(self.env.task.layout)
+        self.features = training_features(options, stages)
         self.outputs = self.task.action_size if isinstance(self.task, TeamTask) else 4
         self._columns = self.features.columns(self.env.task.layout)
         self._mean, self._scale = (
@@ -129,8 +142,14 @@ class Labels:
         return torch.from_numpy(self._x[rows]), torch.from_numpy(self._y[rows])
 
 
-def make_expert(name: str, task: BaseTask) -> Policy:
+def make_expert(name: str, task: BaseTask, separation: float | None = None) -> Policy:
     """The policy to imitate.
+
+    Args:
+        name: Of the policy; empty for the one of the mission.
+        task: Where it flies.
+        separation: Distance that it keeps, m: what imitates it is less exact, and between the task's
+            separation and a crash are 7 cm. None for the task's own.
 
     Raises:
         ValueError: If it is unknown, sees more than observations, or remembers what a network cannot.
@@ -141,6 +160,12 @@ def make_expert(name: str, task: BaseTask) -> Policy:
             f"dagger has no expert for {mission} tasks: what cooperative-mpc knows of the target is in its "
             "filter, not in an observation; ppo trains there"
         )
+    if separation is not None:
+        if not isinstance(task, TeamTask) or not separation >= task.separation:
+            raise ValueError(
+                f"hyperparameter separation is for teams, and at least their own, got {separation!r} m"
+            )
+        task = replace(task, separation=separation)
     expert = make_policy(name or _EXPERTS[mission], task)
     if is_privileged(expert):
         raise ValueError(
@@ -170,16 +195,21 @@ def train(
         TrainingError: If the loss is not finite.
     """
     torch.manual_seed(seed)
-    flights = LabelledFlights(
-        task_options, make_expert(options.expert, task_options.make_task()), options.rows, seed
-    )
+    expert = make_expert(options.expert, task_options.make_task(), options.separation)
+    if options.episode_steps is not None:
+        if not isinstance(task_options, TeamOptions):
+            raise ValueError(
+                f"hyperparameter episode_steps = {options.episode_steps!r} is for teams: leave it out"
+            )
+        task_options = replace(task_options, max_cycles=options.episode_steps)
+    flights = LabelledFlights(task_options, expert, options.rows, seed, options.stages)
     features, outputs = flights.features, flights.outputs
-    actor = Actor(len(features.names), options.hidden, outputs)
+    actor = Actor(len(features.names), options.hidden, outputs, options.squash)
     if start is not None:
         actor.load(start)
     labels, rng = Labels(len(features.names), outputs), np.random.default_rng([_STREAM, seed, 1])
     optimizer = torch.optim.Adam(actor.parameters, lr=options.learning_rate)
-    network, update = Network(features, *actor.arrays()), 0
+    network, update = Network(features, *actor.arrays(), squash=options.squash), 0
     while (share := spent()) < 1.0:
         beta = 0.0 if options.expert_flies <= 0.0 else max(0.0, 1.0 - share / options.expert_flies)
         x, y, reward = flights.collect(network, beta, options.window)
@@ -191,7 +221,7 @@ def train(
         loss = _fit(actor, optimizer, labels, options, fits, rng)
         if not np.isfinite(loss):
             raise TrainingError(f"the loss is {loss} at update {update}: the last good policy is kept")
-        network = Network(features, *actor.arrays())
+        network = Network(features, *actor.arrays(), squash=options.squash)
         yield Progress(update, labels.count, reward), network
 
 

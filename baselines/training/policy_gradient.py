@@ -20,7 +20,8 @@ from quad_envs.envs.options import TrackingOptions
 
 from ..errors import TrainingError
 from .flights import DifferentiableFlights
-from .networks import Floats, Network, hover_actions, hover_slopes
+from .networks import Floats, Network, Squash, hover_actions, hover_slopes
+from .tanh import fast_tanh
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +51,17 @@ class Progress(NamedTuple):
 
 
 class Actor:
-    """A tanh network in torch, with outputs in [-1, 1]."""
+    """A tanh network in torch.
 
-    def __init__(self, inputs: int, hidden: tuple[int, ...], outputs: int) -> None:
+    Args:
+        inputs: Number of features.
+        hidden: Widths of its layers.
+        outputs: Numbers that it gives.
+        squash: "tanh": outputs lie in [-1, 1]; "clip": they are left as they are, and flights clip them.
+    """
+
+    def __init__(self, inputs: int, hidden: tuple[int, ...], outputs: int, squash: Squash = "tanh") -> None:
+        self.squash = squash
         sizes = (inputs, *hidden, outputs)
         self.layers = [torch.nn.Linear(a, b) for a, b in pairwise(sizes)]
         with torch.no_grad():  # begins near hover
@@ -62,9 +71,10 @@ class Actor:
 
     def __call__(self, x: Any) -> Any:
         """Outputs for scaled features (n, inputs), (n, outputs)."""
-        for layer in self.layers:
-            x = torch.tanh(layer(x))
-        return x
+        for layer in self.layers[:-1]:
+            x = fast_tanh(layer(x))
+        x = self.layers[-1](x)
+        return fast_tanh(x) if self.squash == "tanh" else x
 
     def load(self, network: Network) -> None:
         """Take over the weights of a network.
@@ -73,10 +83,10 @@ class Actor:
             ValueError: If it has other layers.
         """
         shapes = [tuple(layer.weight.shape[::-1]) for layer in self.layers]
-        if [W.shape for W in network.weights] != shapes:
+        if [W.shape for W in network.weights] != shapes or network.squash != self.squash:
             raise ValueError(
-                f"cannot go on from layers {[W.shape for W in network.weights]} with layers {shapes}: give "
-                "the same hidden sizes"
+                f"cannot go on from layers {[W.shape for W in network.weights]} ({network.squash}) with "
+                f"layers {shapes} ({self.squash}): give the same hidden sizes and squash"
             )
         with torch.no_grad():
             for layer, W, b in zip(self.layers, network.weights, network.biases, strict=True):

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,13 +20,15 @@ from stable_baselines3.common.vec_env import VecEnv
 from quad_envs.envs.team_options import TeamOptions
 
 from ..errors import TrainingError
-from .lagrangian import LagrangianEnv, Multiplier
+from .features import training_features
+from .lagrangian import LagrangianBuffer, LagrangianEnv, Multiplier, Probe
 from .learner import RowBuffer, Tanh
-from .networks import Features, Network, default_features
+from .networks import Features, Network
 from .policy_gradient import Progress
 from .sb3_options import PpoLagrangianOptions, PpoOptions, SacOptions
 from .vec_env import TaskOptions, TrainingVecEnv
 
+_PROBES = 500_000_009  # from the seed of training to that of the flights which measure violations
 _NEVER = 2**31  # updates between logs of stable-baselines3; runs keep their own
 
 
@@ -77,8 +81,13 @@ def train_ppo_lagrangian(
             "tilt_limit, velocity_limit, position_limit or rate_limit"
         )
     multiplier = Multiplier(options.limit, options.proportional, options.integral)
-    model = make_ppo(LagrangianEnv(flights, multiplier), options, seed, spent)
-    yield from _updates(model, flights, options, spent, start, multiplier)
+    env = LagrangianEnv(flights, options.discount)
+    buffer = {"env": env, "multiplier": multiplier, "epochs": options.epochs}
+    torch.manual_seed(seed)
+    model = make_ppo(env, options, seed, spent, (LagrangianBuffer, buffer))
+    # Other starts than those of training, so that both see new ones.
+    probe = Probe(make_flights(task_options, replace(options, rows=options.probes), seed + _PROBES, start))
+    yield from _updates(model, flights, options, spent, start, (multiplier, probe))
 
 
 def train_sac(
@@ -114,20 +123,21 @@ def make_flights(
             no rotor commands.
     """
     size = task_options.vehicles if isinstance(task_options, TeamOptions) else 1
-    layout = task_options.make_task().layout
-    if options.stages is not None and not set(options.stages) <= set(range(layout.preview + 1)):
-        raise ValueError(
-            f"hyperparameter stages: the preview has stages 0 to {layout.preview}, got {options.stages!r}"
-        )
-    features = default_features(layout, options.stages)
+    features = training_features(task_options, options.stages)
     if start is not None:
         features = start.features
     n = max(1, options.rows // size)
     return TrainingVecEnv(task_options, n, seed, features=features, episode_steps=options.episode_steps)
 
 
-def make_ppo(env: VecEnv, options: PpoOptions, seed: int, spent: Callable[[], float]) -> PPO:
-    """The learner, not yet trained."""
+def make_ppo(
+    env: VecEnv,
+    options: PpoOptions,
+    seed: int,
+    spent: Callable[[], float],
+    buffer: tuple[type[RowBuffer], dict[str, Any]] = (RowBuffer, {}),
+) -> PPO:
+    """The learner, not yet trained; `buffer` is the class of its rollouts and what that needs."""
     samples = env.num_envs * options.horizon
     model = PPO(
         "MlpPolicy",
@@ -147,7 +157,8 @@ def make_ppo(env: VecEnv, options: PpoOptions, seed: int, spent: Callable[[], fl
             "log_std_init": options.log_std,
             "optimizer_kwargs": {"eps": 1e-5, "fused": True},
         },
-        rollout_buffer_class=RowBuffer,
+        rollout_buffer_class=buffer[0],
+        rollout_buffer_kwargs=buffer[1],
         seed=seed,
         device="cpu",
     )
@@ -238,7 +249,7 @@ def _updates(
     options: PpoOptions | SacOptions,
     spent: Callable[[], float],
     start: Network | None,
-    multiplier: Multiplier | None = None,
+    bound: tuple[Multiplier, Probe] | None = None,
 ) -> Iterator[tuple[Progress, Network]]:
     """Learn in pieces of `horizon` steps of all rows, each checked before it is handed out."""
     if start is not None:
@@ -259,8 +270,9 @@ def _updates(
         if _unsound(model) is not None:
             raise _lost(model, update)
         tally = flights.tally()
-        if multiplier is not None and isinstance(options, PpoLagrangianOptions) and spent() >= options.free:
-            multiplier.update(tally.violation_share)
+        if bound is not None and isinstance(options, PpoLagrangianOptions) and spent() >= options.free:
+            multiplier, probe = bound
+            multiplier.update(probe.share(model, options.horizon))
         yield Progress(update, model.num_timesteps, tally.reward), export(model, flights.features)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 
 _POSITIVE = (
     *("rows", "horizon", "batch", "epochs", "learning_rate", "final_rate", "discount", "clip"),
-    *("gradient_norm", "gradient_steps", "memory", "smoothing"),
+    *("gradient_norm", "gradient_steps", "memory", "smoothing", "probes"),
 )
 _SHARES = ("free", "final_rate", "discount", "trace", "smoothing")
 
@@ -41,10 +41,11 @@ class PpoOptions:
 class PpoLagrangianOptions(PpoOptions):
     """Hyperparameters of PPO with a bound on the share of violating steps."""
 
-    limit: float = 0.01  # of the share of violating steps in training
+    limit: float = 0.01  # of the share of violating steps without the noise of training
     free: float = 0.5  # share of the budget before the multiplier moves: first fly, then keep limits
     proportional: float = 0.2  # multiplier per relative excess, which counts up to 1
     integral: float = 0.02  # the same, per update
+    probes: int = 64  # vehicles that fly without noise, by which violations are measured
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,48 @@
+"""What networks in training see: everything that can differ from one observation of the task to another."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from quad_envs.envs.options import TrackingOptions
+from quad_envs.envs.team_options import TeamOptions
+from quad_envs.graphs import in_neighbours
+
+from .networks import Features, default_features
+
+
+def training_features(
+    options: TrackingOptions | TeamOptions, stages: tuple[int, ...] | None = None
+) -> Features:
+    """The default features without comm slots that nobody fills in this task's graphs.
+
+    Args:
+        options: Of the task.
+        stages: Preview stages to keep; None for the usual ones.
+
+    Raises:
+        ValueError: If the preview has not these stages.
+    """
+    layout = options.make_task().layout
+    if stages is not None and not set(stages) <= set(range(layout.preview + 1)):
+        raise ValueError(
+            f"hyperparameter stages: the preview has stages 0 to {layout.preview}, got {stages!r}"
+        )
+    features = default_features(layout, stages)
+    if not isinstance(options, TeamOptions):
+        return features
+    used = in_neighbours(options.graphs.graphs).shape[1]
+    empty = tuple(
+        name
+        for slot in range(used, options.task.layout.neighbours)
+        for name in (f"comm[{slot}]", f"measured[{slot + 1}]", f"estimate[{slot + 1}]")
+    )
+    kept = [k for k, name in enumerate(features.names) if not name.startswith(empty)] if empty else None
+    if kept is None:
+        return features
+    return replace(
+        features,
+        names=tuple(features.names[k] for k in kept),
+        mean=tuple(features.mean[k] for k in kept),
+        scale=tuple(features.scale[k] for k in kept),
+    )
