@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,17 +11,14 @@ from baselines.errors import ResultsError
 from baselines.evaluation import NO_SPANNING_TREE
 from quad_envs.names import unknown_name
 
-from .flights import BadFlightError, read_flight
 from .folder import Finished, Run
 from .leaderboard import leaderboard
-from .model import PAGE_FORMAT, Environment, Flight, Report
+from .model import PAGE_FORMAT, Environment, Report
 from .page import render_page
-from .quantise import Blobs
+from .shelf import fill_shelf
 
-PAGE_BYTES = 2_900_000  # a page stays below 3 MB, its own text included
-_PER_FLIGHT = 1100  # bytes of JSON around a flight's series
-_STRIDES = (1, 2, 4, 8, 16)
-_NOTES = 12  # that are listed one by one
+PAGE_BYTES = 2_900_000  # a page stays below 3 MB
+_OTHER_BYTES = 250_000  # of them for its own text and the leaderboards
 
 
 class Choice(NamedTuple):
@@ -54,11 +51,10 @@ def build_report(run: Run, choice: Choice | None = None) -> Report:
     wanted = None if choice is None else _resolve(run, choice)
     if wanted is not None:
         environments = [entry for entry in environments if entry[0].title == wanted["env"]]
-    shelf = _Shelf(PAGE_BYTES - 150_000)  # the rest is for the page's own text and the leaderboards
-    units = [here for _, _, here in environments]
-    flights, left_out = shelf.fill(units, None if wanted is None else wanted["seed"])
+    seed = None if wanted is None else wanted["seed"]
+    shelf = fill_shelf([here for _, _, here in environments], PAGE_BYTES - _OTHER_BYTES, seed)
     shown = []
-    for (env, results, here), found in zip(environments, flights, strict=True):
+    for (env, results, here), found in zip(environments, shelf.flights, strict=True):
         columns, rows = leaderboard(results.summary(), results.base_of(env.title))
         trees = [one.evaluation.spanning_tree for one in here]
         note = NO_SPANNING_TREE if False in trees else ""
@@ -67,83 +63,15 @@ def build_report(run: Run, choice: Choice | None = None) -> Report:
         shown.append(
             Environment(env.title, env.id, env.kwargs, facts, base, note, columns, rows, tuple(found))
         )
-    notes = (*_notes_of_run(run), *shelf.notes(left_out))
+    notes = (*_notes_of_run(run), *shelf.notes)
     return Report(
         PAGE_FORMAT, run.suite.name, _provenance(run), notes, tuple(shown), shelf.blobs.texts(), wanted
     )
 
 
-class _Shelf:
-    """Takes flights until the page is full."""
-
-    def __init__(self, room: int) -> None:
-        self.room, self.blobs, self.stride, self.bad = room, Blobs(), 1, dict[str, None]()
-        self.count = 0
-
-    def fill(
-        self, environments: Sequence[Sequence[Finished]], seed: int | None
-    ) -> tuple[list[list[Flight]], int]:
-        """Flights of each environment, and how many saved ones did not fit."""
-        starts = [_starts(here) if seed is None else [seed] for here in environments]
-        for self.stride in _STRIDES:
-            self.blobs, self.count = Blobs(), 0
-            flights = [
-                list(self._read(here, start[:1])) for here, start in zip(environments, starts, strict=True)
-            ]
-            if self._used() <= self.room:
-                break
-        left_out, full = 0, False
-        for rank in range(1, max(map(len, starts), default=0)):
-            for here, start, found in zip(environments, starts, flights, strict=True):
-                before, count = len(self.blobs.texts()), self.count
-                if rank >= len(start):
-                    continue
-                more = [] if full else list(self._read(here, start[rank : rank + 1]))
-                if self._used() > self.room:
-                    self.blobs.forget_after(before)
-                    full, self.count, more = True, count, []
-                left_out += sum(start[rank] in dict(one.flights()) for one in here) if full else 0
-                found += more
-        return flights, left_out
-
-    def _used(self) -> int:
-        return self.blobs.size + self.count * _PER_FLIGHT
-
-    def _read(self, here: Iterable[Finished], seeds: Sequence[int]) -> Iterator[Flight]:
-        """Flights of all policies from these starts; what cannot be read is noted."""
-        for one in here:
-            saved = dict(one.flights())
-            for seed in seeds:
-                path = one.unit.episode_file(seed)
-                if seed not in saved or path is None:
-                    continue
-                try:
-                    yield read_flight(
-                        path, one.unit.policy.title, saved[seed], one.task, self.blobs, self.stride
-                    )
-                    self.count += 1
-                except BadFlightError as error:
-                    self.bad[str(error)] = None
-
-    def notes(self, left_out: int) -> list[str]:
-        """What was left out, in words."""
-        bad, out = list(self.bad), []
-        if self.stride > 1:
-            out.append(f"Of the flights one sample in {self.stride} is shown, to keep this page small.")
-        if left_out:
-            out.append(
-                f"{left_out} more saved flights are not in this page, to keep it small; "
-                "quad-envs replay RUN --env ENV --seed N shows any of them."
-            )
-        out += bad[:_NOTES]
-        if len(bad) > _NOTES:
-            out.append(f"{len(bad) - _NOTES} more flights are missing or damaged.")
-        return out
-
-
 def _starts(here: Sequence[Finished]) -> list[int]:
     """Seeds of which some policy has saved its flight."""
-    return sorted({seed for one in here for seed, _ in one.flights()})
+    return sorted({seed for one in here for seed in one.flights()})
 
 
 def _resolve(run: Run, choice: Choice) -> dict[str, Any]:

@@ -43,7 +43,8 @@ def read_flight(
         BadFlightError: If it is missing, damaged, or not the file of a flight.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # Opened here, because np.load leaves a damaged file open.
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
             arrays = {key: file[key] for key in file.files}
         return _flight(arrays, policy, team, task, blobs, stride)
     except FileNotFoundError as error:

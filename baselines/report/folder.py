@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,9 +27,9 @@ class Finished(NamedTuple):
     task: dict[str, Any]
     flights_saved: int  # the first ones
 
-    def flights(self) -> list[tuple[int, list[Record]]]:
-        """Seeds whose flight was saved, with the records of its vehicles."""
-        return list(by_flight(self.evaluation.records).items())[: self.flights_saved]
+    def flights(self) -> dict[int, list[Record]]:
+        """Seeds whose flight was saved -> records of its vehicles."""
+        return dict(islice(by_flight(self.evaluation.records).items(), self.flights_saved))
 
 
 class Run(NamedTuple):
@@ -52,7 +53,7 @@ class Run(NamedTuple):
 
 def _results(suite: Suite, env: EnvChoice, here: Sequence[Finished]) -> Results:
     """The table of one environment, with the policies that have been flown there."""
-    policies = tuple(one.unit.policy for one in here)
+    policies = tuple(replace(one.unit.policy, envs=()) for one in here)  # `envs` may name others than this
     base = suite.base if suite.base in [policy.title for policy in policies] else ""
     part = Suite(suite.name, (env,), policies, suite.episodes, suite.seed, base)
     return Results(part, tuple(one.evaluation for one in here))

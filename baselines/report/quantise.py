@@ -31,6 +31,9 @@ class Blobs:
             self.size += len(text)
         return self._numbers[text]
 
+    def __len__(self) -> int:
+        return len(self._numbers)
+
     def texts(self) -> tuple[str, ...]:
         """All texts, by their numbers."""
         return tuple(self._numbers)

@@ -94,7 +94,7 @@ function list(title, entries) {
 
 function words(value) {
   if (value === null) return "none";
-  if (typeof value === "number") return String(Number(value.toPrecision(8)));
+  if (typeof value === "number") return Math.abs(value) < 1e-12 ? "0" : String(Number(value.toPrecision(6)));
   if (Array.isArray(value)) return value.every((entry) => !Array.isArray(entry)) ? `(${value.map(words).join(", ")})` : value.map(words).join(" ");
   if (typeof value === "object") return Object.entries(value).map(([key, entry]) => `${key} ${words(entry)}`).join(", ") || "defaults";
   return String(value);

@@ -116,24 +116,27 @@ class Plot {
   }
 
   drawShades(context, width, bottom, limit) {
-    const { band, above, limits } = this.spec;
+    const { band, above: forbidden, limits } = this.spec;
     const inner = width - MARGIN.left - MARGIN.right;
     if (band) {
       context.fillStyle = withAlpha(css("--c2"), 0.16);
       context.fillRect(MARGIN.left, this.y(band[1]), inner, this.y(band[0]) - this.y(band[1]));
     }
-    if (above !== undefined && this.y(above) > MARGIN.top) {
+    if (forbidden !== undefined && this.y(forbidden) > MARGIN.top) {
       context.fillStyle = css("--wash");
-      context.fillRect(MARGIN.left, MARGIN.top, inner, Math.min(this.y(above), bottom) - MARGIN.top);
+      context.fillRect(MARGIN.left, MARGIN.top, inner, Math.min(this.y(forbidden), bottom) - MARGIN.top);
     }
     context.setLineDash([5, 3]);
+    let above = Infinity; // height of the label before
     for (const { value, text } of limits) {
       const y = this.y(value);
       if (y < MARGIN.top - 1 || y > bottom + 1) continue;
       context.strokeStyle = context.fillStyle = limit;
       strokeLine(context, MARGIN.left, y, width - MARGIN.right, y);
       context.textAlign = "right";
-      if (text) context.fillText(text, width - MARGIN.right - 3, y > MARGIN.top + 12 ? y - 3 : y + 11);
+      const beside = Math.abs(y - above) < 13 ? 34 : 3; // two labels at one height stand side by side
+      if (text) context.fillText(text, width - MARGIN.right - beside, y > MARGIN.top + 12 ? y - 3 : y + 11);
+      above = y;
     }
     context.setLineDash([]);
   }

@@ -12,7 +12,7 @@ function plotsOf(shown, environment, focus) {
   const context = { shown, task, focus };
   const plots = [
     distancePlot(context),
-    teamPlot(context, "slot_error", "Formation error", "m, to the own slot"),
+    slotPlot(context),
     separationPlot(context),
     estimatePlot(context),
     neesPlot(context),
@@ -62,8 +62,9 @@ function distancePlot(context) {
   return { title: "Position error", unit: "m", groups, zero: true, limits: [] };
 }
 
-function teamPlot(context, name, title, unit) {
-  return { title, unit, groups: groupsOf(context, name, plain), zero: true, limits: [] };
+function slotPlot(context) {
+  if (context.task.mission === "estimation") return null; // there it is the error of the estimate
+  return { title: "Formation error", unit: "m, to the own slot", groups: groupsOf(context, "slot_error", plain), zero: true, limits: [] };
 }
 
 function separationPlot(context) {

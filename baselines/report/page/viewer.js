@@ -5,7 +5,7 @@ const byId = (id) => document.getElementById(id);
 
 const viewer = {
   environment: null, camera: new Camera(), scenes: [], plots: [], shown: [],
-  seed: null, chosen: new Set(), layout: "overlay", focus: null,
+  seed: null, chosen: new Set(), layout: "overlay", focus: null, follow: "",
   time: 0, length: 1, speed: 1, playing: false, hovered: null, hoveredPlot: null, turn: 0,
 
   async open(environment, opened) {
@@ -23,6 +23,7 @@ const viewer = {
     this.chosen = new Set(this.firstChoice(opened?.policy));
     this.time = 0;
     this.camera.home();
+    this.follow = "";
     await this.refresh(true);
   },
 
@@ -38,9 +39,9 @@ const viewer = {
   firstChoice(wanted) {
     const here = this.flightsHere().map((flight) => flight.policy);
     if (wanted && here.includes(wanted)) return [wanted];
-    const best = [...this.flightsHere()].sort((a, b) => b.score - a.score)[0]?.policy;
-    const base = here.includes(this.environment.base) ? this.environment.base : here.find((name) => name !== best);
-    return [best, base].filter(Boolean);
+    const [best, second] = [...this.flightsHere()].sort((a, b) => b.score - a.score).map((flight) => flight.policy);
+    const { base } = this.environment;
+    return [best, here.includes(base) && base !== best ? base : second].filter(Boolean);
   },
 
   colourIndex(policy) {
@@ -131,9 +132,28 @@ const viewer = {
       this.refresh();
     }));
     focus.hidden = size < 2;
+    const view = selectOf("View", this.views(size), this.follow, (value) => {
+      this.follow = value;
+      this.camera.follow(value === "target" ? 0.5 : value ? 1.6 : null);
+      this.drawScenes();
+    });
     const active = document.activeElement?.closest("#choices") && document.activeElement.dataset.name;
-    byId("choices").replaceChildren(start, chips, layout, focus);
+    byId("choices").replaceChildren(start, chips, layout, element("label", {}, "View", view), focus);
     if (active) [...chips.children].find((chip) => chip.dataset.name === active)?.focus();
+  },
+
+  views(size) {
+    const vehicles = Array.from({ length: size }, (_, i) => [String(i), size > 1 ? `follow vehicle ${i + 1}` : "follow the vehicle"]);
+    const target = this.shown.some(({ flight }) => flight.tables.target) ? [["target", "follow the target"]] : [];
+    return [["", "whole scene"], ...vehicles, ...target];
+  },
+
+  /** What the camera looks at, where it follows something. */
+  anchor(scene) {
+    const { flight } = scene.shown[0];
+    const table = this.follow === "target" ? flight.tables.target?.[0] : flight.tables.p[Number(this.follow)];
+    if (this.follow === "" || !table) return null;
+    return samplePoint(table, Math.min(this.time / flight.dt, table[0].length - 1));
   },
 
   chip(flight) {
@@ -182,7 +202,10 @@ const viewer = {
   },
 
   drawScenes() {
-    this.scenes.forEach((scene) => scene.draw(this.time));
+    for (const scene of this.scenes) {
+      this.camera.anchor = this.anchor(scene);
+      scene.draw(this.time);
+    }
   },
 
   mark() {
