@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from .errors import MissingPackageError
 from .options import (
     BenchmarkOptions,
+    CertifyOptions,
     DoctorOptions,
     EvaluateOptions,
     ListOptions,
@@ -79,6 +80,12 @@ def _replay(options: ReplayOptions) -> int:
     return commands.replay(options)
 
 
+def _certify(options: CertifyOptions) -> int:
+    from .certify import command
+
+    return command.certify_one(options)
+
+
 def _doctor(options: DoctorOptions) -> int:
     from . import doctor
 
@@ -93,6 +100,7 @@ COMMANDS: dict[str, Command] = {
     "reproduce": Command(ReproduceOptions, _reproduce),
     "report": Command(ReportOptions, _report),
     "replay": Command(ReplayOptions, _replay),
+    "certify": Command(CertifyOptions, _certify),
     "doctor": Command(DoctorOptions, _doctor),
 }
 

@@ -121,6 +121,22 @@ class ReplayOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class CertifyOptions:
+    """What the stability theory of chapter 9 says of a policy, and what not."""
+
+    env: Annotated[str, Positional("environment id of one vehicle, as quad/HelixTracking-v0")]
+    policy: Annotated[str, Positional("lmpc, sdc-nmpc, sdre, lqr or nmpc")]
+    seed: Annotated[int, "of the flight and of the random starts"] = 0
+    starts: Annotated[int, "random starts in each invariant ellipsoid"] = 100
+    set: Annotated[list[str], "keyword argument of the environment; JSON, else text"] = field(
+        default_factory=list
+    )
+    policy_set: Annotated[list[str], "option of the policy; JSON, else text"] = field(default_factory=list)
+    json: Annotated[bool, "print JSON"] = False
+    out: Annotated[Path | None, "folder for certify.json and the figures"] = None
+
+
+@dataclass(frozen=True, slots=True)
 class DoctorOptions:
     """Look at the installation and fly a moment."""
 

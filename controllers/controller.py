@@ -112,6 +112,30 @@ def as_rows(
     return plants, windows, lasts, disturbances, memories
 
 
+def as_one_row(
+    plant: ArrayLike,
+    window: ArrayLike,
+    last_command: ArrayLike,
+    disturbance: ArrayLike,
+    memory: ArrayLike,
+    stages: int,
+    memory_size: int,
+) -> tuple[Array, Array, Array, Array, Array]:
+    """The arguments of `decide` for one vehicle, without the axis over vehicles.
+
+    Raises:
+        ValueError: If a shape is wrong or a number is not finite.
+    """
+    first, second, third, fourth, fifth = (
+        np.asarray(value)[None] for value in (plant, window, last_command, disturbance, memory)
+    )
+    rows = as_rows(first, second, third, fourth, fifth, stages, memory_size)
+    bad = first_non_finite(*rows, stages)
+    if bad >= 0:
+        raise_non_finite(bad)
+    return rows[0][0], rows[1][0], rows[2][0], rows[3][0], rows[4][0]
+
+
 @kernel
 def all_finite(values: Array) -> bool:
     """Whether all numbers are finite; without a branch, so that it vectorises."""

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, VELOCITY, Array, Limits
 from quad_envs.tasks import BaseTask, Task
 
-from .controller import Decision, as_rows, first_non_finite, raise_non_finite
+from .controller import Decision, as_one_row, as_rows, first_non_finite, raise_non_finite
 from .disturbance import ESTIMATOR_SIZE
 from .fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXED_WEIGHT
 from .model import hover_pair
@@ -178,6 +178,30 @@ class Mpc(ABC):
             raise_non_finite(bad)
         return Decision(command, kept, report[0], report[1])
 
+    def problem(
+        self,
+        plant: ArrayLike,
+        window: ArrayLike,
+        last_command: ArrayLike,
+        disturbance: ArrayLike,
+        memory: ArrayLike,
+    ) -> OcpQp:
+        """The OCP-QP of the first pass of one vehicle's decision, for study; arguments of `decide`, one row.
+
+        It lives in the frame of the problem (`MpcOptions.frame`), and its inputs are u = F - F_trim with
+        F_trim = -lower.
+
+        Raises:
+            ValueError: If a shape is wrong or a number is not finite.
+        """
+        row = as_one_row(plant, window, last_command, disturbance, memory, self.horizon + 1, self.memory_size)
+        which, buffer, ws = self._scratch()
+        s = carve(buffer, self.horizon, *self._sizes())
+        begin_row(*row, which, self._data, s)
+        qp = self._as_qp(self._pose(0, row[-1], s, ws), s)
+        rows = StateRows._make(np.array(value) for value in qp.rows)
+        return OcpQp._make(np.array(v) if isinstance(v, np.ndarray) else v for v in (*qp[:-1], rows))
+
     @abstractmethod
     def _decide_rows(self, *arrays: Any) -> int:
         """The whole batch in one compiled call."""
@@ -249,11 +273,7 @@ class Mpc(ABC):
             from .solvers.osqp import OsqpSolver
 
             self._backend = OsqpSolver()
-        rows = StateRows(s.normals, self._data.normal, self._data.stage, s.row_lower, s.row_upper, s.weight)
-        qp = OcpQp(
-            *problem[:2], s.c, problem.Q, self._data.R, *problem[3:5], s.x_0, problem.r, s.lower, s.upper,
-            self._data.rate_step, s.u_last, rows,
-        )  # fmt: skip
+        qp = self._as_qp(problem, s)
         solution = self._backend.solve(qp)
         iterations = solution.iterations
         if solution.status == Status.INFEASIBLE and level == NONE:
@@ -271,6 +291,14 @@ class Mpc(ABC):
             return HOVER, iterations
         ws.u[:], ws.x[:] = solution.u, solution.x
         return level, iterations
+
+    def _as_qp(self, problem: Problem, s: Scratch) -> OcpQp:
+        """The problem of one pass as data; views of the scratch memory."""
+        rows = StateRows(s.normals, self._data.normal, self._data.stage, s.row_lower, s.row_upper, s.weight)
+        return OcpQp(
+            *problem[:2], s.c, problem.Q, self._data.R, *problem[3:5], s.x_0, problem.r, s.lower, s.upper,
+            self._data.rate_step, s.u_last, rows,
+        )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but scratch memory and the backend's, which are made again when needed."""

@@ -6,20 +6,21 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from quad_envs._numba import kernel
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 from quad_envs.tasks import Task
 
-from .controller import FeedbackLaw, first_non_finite
+from .controller import FeedbackLaw, as_one_row, first_non_finite
 from .disturbance import feed_forward
 from .fallback import CLIPPED_SDRE, HOVER, NONE, limit_command
 from .linalg import copy
-from .model import hover_pair, sdc_matrix, zero_order_hold
+from .model import hover_pair, sdc_matrix, sdc_pair, zero_order_hold
 from .mpc import Frame, VelocityReference, require_choice
 from .mpc_kernels import copy_vector, set_references, set_state
-from .ocp import IntArray
-from .riccati import DARE_SCRATCH, lqr_gain, solve_dare, stage_gains
+from .ocp import IntArray, OcpQp, no_rows
+from .riccati import DARE_SCRATCH, dare, lqr_gain, solve_dare, stage_gains
 
 _MATRICES = DARE_SCRATCH + 6
 
@@ -159,6 +160,36 @@ class Sdre(FeedbackLaw):
     def _decide_rows(self, *arrays: Any) -> int:
         arguments: tuple[Any, ...] = (*arrays, *self._constants, self._scratch)
         return _decide_rows(*arguments)
+
+    def problem(
+        self,
+        plant: ArrayLike,
+        window: ArrayLike,
+        last_command: ArrayLike,
+        disturbance: ArrayLike,
+        memory: ArrayLike,
+    ) -> OcpQp:
+        """The OCP-QP of horizon zero whose cost is this law's cost to go, for study; see `Mpc.problem`.
+
+        Q_f is P(x) of the pair at x; a disturbance that is revealed moves r_0, but not the model.
+
+        Raises:
+            ValueError: If a shape is wrong, a number is not finite, or the pair at x has no P.
+        """
+        plant_row, rows, last, revealed, _ = as_one_row(
+            plant, window, last_command, disturbance, memory, 1, 0
+        )
+        alpha, heading, attitude, c, _, Q, R, _, dt, force_max, rate_step = self._constants
+        offset, trim, x, r = np.zeros(N_INPUT), np.zeros(N_STATE), np.zeros(N_STATE), np.zeros((1, N_STATE))
+        feed_forward(revealed, plant_row[8], c, force_max, offset, trim)
+        set_state(plant_row, heading, x)
+        set_references(plant_row, rows, trim, heading, attitude, r)
+        params = self.task.params
+        A, B = hover_pair(params, dt) if alpha < 0.0 else sdc_pair(x, params, dt, alpha)
+        return OcpQp(
+            A[None], B[None], np.zeros((0, N_STATE)), Q[None], R, dare(A, B, Q, R), True, x, r,
+            -offset, force_max - offset, rate_step, last - offset, no_rows(),
+        )  # fmt: skip
 
 
 class Lqr(Sdre):
