@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from .metrics import Estimate, Record, estimate, measure, paired_difference
     from .policy import Policy, PolicyState, make_policy, policy_options
     from .rollout import Episode, run_episodes
-    from .suite import Suite, load_suite
+    from .suite import Suite
+    from .suite_files import load_suite
     from .trained import load_policy, shipped_policies
     from .training.runs import TrainingResult, train
 
@@ -39,7 +40,7 @@ _PUBLIC = {
     "estimate": "metrics",
     "evaluate": "evaluation",
     "load_policy": "trained",
-    "load_suite": "suite",
+    "load_suite": "suite_files",
     "make_policy": "policy",
     "measure": "metrics",
     "paired_difference": "metrics",

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from quad_envs.tasks import TeamTask
 
+from .checks import require_whole
 from .comparison import Results
 from .engines import check_engine, run_units
 from .environments import make_env
@@ -37,7 +38,11 @@ from .results import (
     write_json,
 )
 from .rollout import Episode
-from .suite import Suite, Unit, load_suite, suite_units
+from .suite import PolicyChoice, Suite, is_for
+from .suite_files import load_suite
+from .trained import shipped_name
+from .training.finished import train_unit, training_plan
+from .units import Unit, suite_units, training_units
 
 REPORTED = 2  # flights of each unit that are saved for the report where not all are asked for
 
@@ -48,7 +53,7 @@ def fly_unit(unit: Unit) -> dict[str, Any]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # said once before the first unit
         env = make_env(unit.env.id, **unit.env.kwargs)
-    policy = make_policy(unit.policy.name, env, **unit.policy.kwargs)
+    policy = make_policy(unit.policy_name, env, **unit.policy.kwargs)
     save = None if unit.episode_folder is None else _saver(unit, env)
     found = evaluate(policy, env, unit.episodes, unit.seed, on_episode=save)
     env.close()
@@ -133,13 +138,15 @@ def run_benchmark(
     jobs: int = 1,
     save_episodes: bool = False,
     fresh: bool = False,
+    networks: str | Path | None = None,
     on_unit: Callable[[int, int], None] | None = None,
 ) -> Results:
     """Fly every policy of a suite in every environment, from the same starts.
 
-    An interrupted run goes on where it stopped when it is called again with the same folder: each finished
-    unit (environment x policy) is stored at once; one whose flights are all asked for and were not saved is
-    flown again. The folder gets a report.html. Decision times mean something with jobs = 1, or idle cores.
+    Networks that the suite trains come first. An interrupted run goes on where it stopped when it is called
+    again with the same folder: each finished unit (environment x policy) is stored at once; one whose flights
+    are all asked for and were not saved is flown again. The folder gets a report.html. Decision times mean
+    something with jobs = 1, or idle cores.
 
     Args:
         suite: Name of a shipped suite, path of a TOML file, mapping, or Suite.
@@ -148,7 +155,9 @@ def run_benchmark(
         jobs: Units flown at a time, >= 1.
         save_episodes: Whether to write every flight to out/episodes, and not only the first REPORTED of each
             unit, which the report shows.
-        fresh: Whether to discard what the folder holds of an earlier run.
+        fresh: Whether to discard what the folder holds of an earlier run, but for trained networks.
+        networks: Where networks that the suite trains are, or go; out/networks if not given. Those that are
+            trained as the suite wants are taken as they are.
         on_unit: Called with (finished, all) at the beginning and after each unit.
 
     Raises:
@@ -157,51 +166,80 @@ def run_benchmark(
     """
     suite = load_suite(suite)
     check_engine(engine)
-    if isinstance(jobs, bool) or not isinstance(jobs, int) or jobs < 1:
-        raise ValueError(f"jobs must be a whole number >= 1, got {jobs!r}")
+    require_whole("jobs", jobs, 1)
     if save_episodes and out is None:
         raise ValueError("save_episodes needs a folder: give out")
+    if training_units(suite) and out is None and networks is None:
+        raise ValueError(f"suite {suite.name!r} trains networks, which need a folder: give out or networks")
     folder = None if out is None else Path(out).absolute()
     _refuse_bad_units(suite)
     hold: AbstractContextManager[None] = nullcontext() if folder is None else locked(folder)
     with hold:
+        home = Path(networks or (folder or Path()) / "networks").absolute()
+        to_train = training_units(suite, home)
         episodes = None if folder is None else folder / "episodes"
-        units = suite_units(suite, episodes, suite.episodes if save_episodes else REPORTED)
+        units = suite_units(suite, episodes, suite.episodes if save_episodes else REPORTED, home)
         if folder is not None and fresh:
             discard(folder)
         done = _begin(folder, suite, units, save_episodes)
         report = on_unit or (lambda finished, total: None)
-        report(len(done), len(units))
+        total = len(to_train) + len(units)
+        trained: dict[int, dict[str, Any]] = {}
+        report(len(done), total)
+        for index, training in run_units(train_unit, to_train, engine, jobs):
+            trained[index] = training
+            report(len(trained) + len(done), total)
         for index, cell in run_units(
             fly_unit, [unit for unit in units if unit.number not in done], engine, jobs
         ):
             if folder is not None:
                 write_json(folder / "cells" / units[index].file_name, cell)
             done[index] = cell
-            report(len(done), len(units))
-        results = Results(suite, tuple(Evaluation.from_plain(done[unit.number]["found"]) for unit in units))
+            report(len(trained) + len(done), total)
+        results = Results(
+            suite,
+            tuple(Evaluation.from_plain(done[unit.number]["found"]) for unit in units),
+            tuple(trained[unit.number] for unit in to_train),
+        )
         if folder is not None:
-            write_csv(folder / "summary.csv", results.summary())
-            write_csv(folder / "results.csv", results.rows())
+            _write_tables(folder, results)
             write_atomic(folder / "report.html", render_report(read_run(folder)).encode())
     return results
 
 
+def _write_tables(folder: Path, results: Results) -> None:
+    """The tables of a finished run."""
+    write_csv(folder / "summary.csv", results.summary())
+    write_csv(folder / "results.csv", results.rows())
+    if results.suite.learned:
+        write_csv(folder / "contenders.csv", results.contender_rows())
+
+
 def _refuse_bad_units(suite: Suite) -> None:
     """Make every environment and policy once, so that a mistake shows at once and not after an hour."""
+    for unit in training_units(suite):
+        training_plan(unit)
     for choice in suite.envs:
-        env = make_env(choice.id, **choice.kwargs)
-        for policy in suite.policies:
-            if not policy.flies_in(choice):
-                continue
-            try:
-                make_policy(policy.name, env, **policy.kwargs)
-            except ValueError as error:
-                trained = is_trained(policy.name)
-                if trained or mission_of(env.unwrapped.task) in policy_entry(policy.name).missions:
-                    raise
-                raise ValueError(f"{error}. Say in the suite for which it is: envs = [...]") from error
-        env.close()
+        for flown in suite.flown(choice).values():
+            env = make_env(flown.id, **flown.kwargs)
+            for policy in suite.policies:
+                if policy.train is None and is_for(policy.envs, choice):
+                    _refuse_bad_policy(policy, env)
+            env.close()
+
+
+def _refuse_bad_policy(policy: PolicyChoice, env: Any) -> None:
+    """Make a policy once."""
+    if policy.shipped:
+        make_policy(shipped_name(policy.name, env.unwrapped.task.env_id), env, **policy.kwargs)
+        return
+    try:
+        make_policy(policy.name, env, **policy.kwargs)
+    except ValueError as error:
+        trained = is_trained(policy.name)
+        if trained or mission_of(env.unwrapped.task) in policy_entry(policy.name).missions:
+            raise
+        raise ValueError(f"{error}. Say in the suite for which it is: envs = [...]") from error
 
 
 def _begin(

@@ -62,7 +62,7 @@ def list_names(options: ListOptions) -> int:
     from quad_envs.registration import TRACKING
 
     from .policy import TEAM_POLICIES, TRACKING_POLICIES
-    from .suite import suite_names
+    from .suite_files import suite_names
     from .trained import shipped_policies
 
     if options.name:
@@ -172,16 +172,17 @@ def evaluate_one(options: EvaluateOptions) -> int:
 def benchmark_suite(options: BenchmarkOptions) -> int:
     """Fly a suite, print its tables, and leave a results folder."""
     from .benchmark import run_benchmark
-    from .suite import load_suite, suite_units
+    from .suite_files import load_suite
+    from .units import suite_units, training_units
 
     suite = load_suite(options.suite)
     changes = {
         name: getattr(options, name) for name in ("episodes", "seed") if getattr(options, name) is not None
     }
-    suite = replace(suite, **changes)
+    suite = replace(suite.quick() if options.quick else suite, **changes)
     out = options.out or Path("runs") / f"{suite.name}-{datetime.now():%Y%m%d-%H%M%S}"
     finished = 0
-    with progress(len(suite_units(suite)), "unit") as bar, plain_warnings():
+    with progress(len(training_units(suite)) + len(suite_units(suite)), "unit") as bar, plain_warnings():
 
         def on_unit(count: int, total: int) -> None:
             nonlocal finished
@@ -196,6 +197,7 @@ def benchmark_suite(options: BenchmarkOptions) -> int:
                 jobs=options.jobs,
                 save_episodes=options.save_episodes,
                 fresh=options.fresh,
+                networks=options.networks,
                 on_unit=on_unit,
             )
         except KeyboardInterrupt:
@@ -219,5 +221,7 @@ def _resume(options: BenchmarkOptions, out: Path) -> str:
         words += [] if value is None else [f"--{name} {value}"]
     words += [f"--engine {options.engine}"] if options.engine != "processes" else []
     words += [f"--jobs {options.jobs}"] if options.jobs != 1 else []
+    words += ["--quick"] if options.quick else []
+    words += [f"--networks {shlex.quote(str(options.networks))}"] if options.networks else []
     words += ["--save-episodes"] if options.save_episodes else []
     return " ".join(words)

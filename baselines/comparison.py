@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from .contenders import contender_rows, contender_tables, find_contenders
 from .evaluation import NO_SPANNING_TREE, Evaluation
 from .metrics import paired_difference, totals, worst_violations
-from .suite import EnvChoice, Suite, Unit, suite_units
+from .results import plain_json
+from .suite import EnvChoice, Suite
 from .table import format_number, format_table
+from .units import Unit, suite_units
 
 COMPARED = ("score", "cost", "position_rms", "effort")  # columns with paired differences
 COMPARED_TEAM = ("formation_rms", "min_separation", "estimate_rmse")  # and of a team
@@ -50,7 +54,8 @@ class Results:
     """What `run_benchmark` found; prints as one table per environment."""
 
     suite: Suite
-    evaluations: tuple[Evaluation, ...]  # environments x policies, in the order of the suite
+    evaluations: tuple[Evaluation, ...]  # one per unit of `suite_units`
+    trainings: tuple[Mapping[str, Any], ...] = ()  # one per network that was trained, see `training_units`
 
     def get(self, env: str, policy: str) -> Evaluation:
         """The evaluation of a policy in an environment, by their titles."""
@@ -104,13 +109,27 @@ class Results:
             row |= {name: getattr(ours, name) for name in ("vehicles", "privileged", "spanning_tree")}
         return row
 
+    def contender_rows(self) -> list[dict[str, Any]]:
+        """One row per environment x contender, where all training seeds of an algorithm are one contender."""
+        names = {policy.title: policy.contender for policy in self.suite.policies}
+        contenders = find_contenders(self.suite, self.evaluations, self.trainings)
+        return contender_rows(contenders, names[self.suite.base])
+
     def to_dict(self) -> dict[str, Any]:
         """As plain numbers for JSON."""
-        return {"suite": self.suite.to_dict(), "evaluations": [one.to_dict() for one in self.evaluations]}
+        found: dict[str, Any] = {
+            "suite": self.suite.to_dict(),
+            "evaluations": [one.to_dict() for one in self.evaluations],
+        }
+        if self.suite.learned:
+            found |= {"contenders": plain_json(self.contender_rows()), "trainings": self.trainings}
+        return found
 
     def __str__(self) -> str:
-        flown = {unit.env.title for unit in suite_units(self.suite)}
-        return "\n\n".join(self._table(env) for env in self.suite.envs if env.title in flown)
+        if self.suite.learned:
+            return contender_tables(self.contender_rows())
+        flown = [one for env in self.suite.envs for one in self.suite.flown(env).values()]
+        return "\n\n".join(map(self._table, flown))
 
     def _table(self, env: EnvChoice) -> str:
         rows = [row for row in self.summary() if row["env"] == env.title]

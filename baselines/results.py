@@ -6,6 +6,8 @@ episodes/*.npz     the first flights of each unit, or all if asked for; a team i
 report.html        the leaderboard and these flights to look at, see `baselines.report`
 results.csv        one row per environment x policy x flight (x vehicle), when all units are finished
 summary.csv        one row per environment x policy
+contenders.csv     one row per environment x contender, where networks are trained: all seeds are one
+networks/          folders of the networks that are trained, see training/run_folder.py
 """
 
 from __future__ import annotations
@@ -33,7 +35,15 @@ import quad_envs
 from .errors import ResultsError
 
 _LOCK = ".lock"
-_RESULTS = ("results.csv", "summary.csv", "report.html", "replay.html", "cells/*.json", "episodes/*.npz")
+_RESULTS = (
+    "results.csv",
+    "summary.csv",
+    "contenders.csv",
+    "report.html",
+    "replay.html",
+    "cells/*.json",
+    "episodes/*.npz",
+)
 RESULTS_FORMAT = 2  # of the folder; 1 had neither this number nor the tasks in its cells
 _DISTRIBUTIONS = ("gymnasium", "pettingzoo", "numpy", "scipy", "numba", "osqp", "joblib")
 

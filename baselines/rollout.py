@@ -19,6 +19,7 @@ from quad_envs.observations import N_REFERENCE
 from quad_envs.parameters import Array
 from quad_envs.tasks import BaseTask, TeamTask
 
+from .checks import require_whole
 from .environments import is_parallel, require_own_task
 from .episode import INFO, Episode, Recorder, Said
 from .policy import Policy
@@ -50,10 +51,8 @@ def run_episodes(policy: Policy, env: Any, episodes: int, seed: int = 0) -> Iter
         ValueError: If episodes < 1, the seed < 0, the environment is not of this suite, a vector environment
             resets in the same step, or a privileged policy cannot see the truth.
     """
-    if isinstance(episodes, bool) or not isinstance(episodes, int | np.integer) or episodes < 1:
-        raise ValueError(f"episodes must be a whole number >= 1, got {episodes!r}")
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise ValueError(f"seed must be a whole number >= 0, got {seed!r}")
+    require_whole("episodes", episodes, 1)
+    require_whole("seed", seed, 0)
     require_own_task(env)
     if is_privileged(policy) and not is_parallel(env):
         raise ValueError(

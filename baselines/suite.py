@@ -1,38 +1,21 @@
-"""Suites: which policies fly in which environments, read from small TOML files.
+"""Suites as values: which policies fly in which environments, under which conditions, from which starts.
 
-name = "mine"
-episodes = 10
-seed = 0
-compare_with = "lmpc"        # label of the policy from which differences are taken
-
-envs = "all"                 # or a list of tables
-[[policies]]
-name = "sdc-nmpc"
-label = "sdc-nmpc, N 15"
-kwargs = {horizon = 15}
-
-"all" means the tracking ids, or policies. Multi-agent ids are named, and a policy that is not for all of the
-suite's environments says for which it is: `envs = ["quad/Formation-v0"]`, ids or labels.
+`suite_files` reads them from TOML, `units` cuts them into what is done in one piece.
 """
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
-from importlib import resources
-from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 from quad_envs.names import unknown_name
-from quad_envs.registration import TEAMS, TRACKING
 
-from .policy import TEAM_POLICIES, TRACKING_POLICIES
+from .checks import require_whole
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+# What --quick keeps of a suite.
+_QUICK_SEEDS, _QUICK_CONDITIONS, _QUICK_EPISODES = 2, 2, 5
+_QUICK_BUDGET, _QUICK_SECONDS = 20, 3.0  # divisor of training budgets; CPU-seconds where none is given
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,22 +33,72 @@ class EnvChoice:
 
 
 @dataclass(frozen=True, slots=True)
-class PolicyChoice:
-    """A policy of a suite."""
+class Condition:
+    """Arguments under which environments of a suite are flown, and networks were not trained."""
 
-    name: str
+    label: str
     kwargs: dict[str, Any] = field(default_factory=dict)
-    label: str = ""
-    envs: tuple[str, ...] = ()  # ids or labels of the environments in which it flies; all if empty
+    envs: tuple[str, ...] = ()  # ids or labels; all if empty
 
     @property
     def title(self) -> str:
         """Label for tables."""
-        return self.label or _title(self.name, self.kwargs)
+        return self.label
 
-    def flies_in(self, env: EnvChoice) -> bool:
-        """Whether it is for an environment of the suite."""
-        return not self.envs or env.id in self.envs or env.title in self.envs
+    def of(self, env: EnvChoice) -> EnvChoice:
+        """The environment under this condition."""
+        return EnvChoice(env.id, {**env.kwargs, **self.kwargs}, f"{env.title}, {self.label}")
+
+
+@dataclass(frozen=True, slots=True)
+class Training:
+    """How the network of a policy is trained, in each environment in which it flies.
+
+    Raises:
+        ValueError: If the budget or the seed is not allowed.
+    """
+
+    seed: int = 0
+    steps: int | None = None  # budget in environment steps,
+    seconds: float | None = None  # or in CPU-seconds; the algorithm's own if neither
+    hyper: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        require_whole("seed of a training in a suite", self.seed, 0)
+
+    def quick(self) -> Training:
+        """A small part of the budget."""
+        if self.steps is not None:
+            return replace(self, steps=max(1, self.steps // _QUICK_BUDGET))
+        seconds = _QUICK_SECONDS if self.seconds is None else self.seconds / _QUICK_BUDGET
+        return replace(self, seconds=seconds)
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyChoice:
+    """A policy of a suite."""
+
+    name: str  # of a policy; of an algorithm if it is trained or shipped
+    kwargs: dict[str, Any] = field(default_factory=dict)
+    label: str = ""
+    envs: tuple[str, ...] = ()  # ids or labels of the environments in which it flies; all if empty
+    train: Training | None = None
+    shipped: bool = False  # fly the network of this algorithm that comes with the suite
+
+    @property
+    def contender(self) -> str:
+        """What policies are compared as: all training seeds of an algorithm are one."""
+        return self.label or _title(self.name, self.kwargs) + ", shipped" * self.shipped
+
+    @property
+    def title(self) -> str:
+        """Label for tables."""
+        return self.contender if self.train is None else f"{self.contender}, seed {self.train.seed}"
+
+
+def is_for(names: tuple[str, ...], env: EnvChoice) -> bool:
+    """Whether a policy or condition that names these environments, or none, is for one."""
+    return not names or env.id in names or env.title in names
 
 
 def _title(name: str, kwargs: Mapping[str, Any]) -> str:
@@ -86,20 +119,19 @@ class Suite:
     episodes: int = 20  # per environment and policy
     seed: int = 0  # flight i starts with the environment seed `seed + i`
     compare_with: str = ""  # title of the policy from which differences are taken; the first if empty
+    conditions: tuple[
+        Condition, ...
+    ] = ()  # each environment is flown in each; once as it is if there are none
 
     def __post_init__(self) -> None:
         for name in ("name", "compare_with"):
             if not isinstance(getattr(self, name), str):
                 raise ValueError(f"{name} of a suite must be text, got {getattr(self, name)!r}")
         for name, least in (("episodes", 1), ("seed", 0)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < least:
-                raise ValueError(
-                    f"{name} of suite {self.name!r} must be a whole number >= {least}, got {value!r}"
-                )
-        for kind, choices in (("envs", self.envs), ("policies", self.policies)):
-            titles = [choice.title for choice in choices]
-            if not titles:
+            require_whole(f"{name} of suite {self.name!r}", getattr(self, name), least)
+        for kind in ("envs", "policies", "conditions"):
+            titles = [choice.title for choice in getattr(self, kind)]
+            if not titles and kind != "conditions":
                 raise ValueError(f"suite {self.name!r} has no {kind}")
             for title in titles:
                 if titles.count(title) > 1:
@@ -110,174 +142,70 @@ class Suite:
             raise ValueError(unknown_name(f"compare_with of suite {self.name!r}:", self.compare_with, titles))
 
     def _check_pairs(self) -> None:
-        """Each name in `envs` of a policy is one of an environment here, and each environment is flown."""
+        """Each name in `envs` is one of an environment here, and each environment is flown."""
         known = list(dict.fromkeys(name for env in self.envs for name in (env.id, env.title)))
-        for policy in self.policies:
-            for name in policy.envs:
-                if name not in known:
-                    what = f"environment of policy {policy.title!r} in suite {self.name!r}"
-                    raise ValueError(unknown_name(what, name, known))
+        for kind, choices in (("policy", self.policies), ("condition", self.conditions)):
+            for choice in choices:
+                for name in choice.envs:
+                    if name not in known:
+                        what = f"environment of {kind} {choice.title!r} in suite {self.name!r}"
+                        raise ValueError(unknown_name(what, name, known))
         for env in self.envs:
-            if not any(policy.flies_in(env) for policy in self.policies):
+            if not any(is_for(policy.envs, env) for policy in self.policies):
                 raise ValueError(f"suite {self.name!r} has no policy for {env.title!r}")
+            if not self.flown(env):
+                raise ValueError(f"suite {self.name!r} has no condition for {env.title!r}")
+
+    def flown(self, env: EnvChoice) -> dict[str, EnvChoice]:
+        """Label of each condition that is for an environment -> what is flown; of none "" -> itself."""
+        if not self.conditions:
+            return {"": env}
+        return {one.label: one.of(env) for one in self.conditions if is_for(one.envs, env)}
 
     @property
     def base(self) -> str:
         """Title of the policy from which differences are taken."""
         return self.compare_with or self.policies[0].title
 
+    @property
+    def learned(self) -> bool:
+        """Whether networks are among the policies, which are compared as contenders."""
+        return any(policy.train is not None or policy.shipped for policy in self.policies)
+
+    def quick(self) -> Suite:
+        """A small part, to see it work: one environment, two conditions, two seeds, small budgets."""
+        env = self.envs[0]
+        kept, seen = [], dict[str, int]()
+        for policy in self.policies:
+            seen[policy.contender] = seen.get(policy.contender, 0) + 1
+            if is_for(policy.envs, env) and seen[policy.contender] <= _QUICK_SEEDS:
+                envs = tuple(name for name in policy.envs if name in (env.id, env.title))
+                train = policy.train and policy.train.quick()
+                kept.append(replace(policy, envs=envs, train=train))
+        conditions = [one for one in self.conditions if is_for(one.envs, env)][:_QUICK_CONDITIONS]
+        return replace(
+            self,
+            name=f"{self.name}-quick",
+            envs=(env,),
+            policies=tuple(kept),
+            conditions=tuple(replace(one, envs=()) for one in conditions),
+            episodes=min(self.episodes, _QUICK_EPISODES),
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """As plain values, the form of the TOML file."""
         return asdict(self)
 
-
-_Choice = TypeVar("_Choice", EnvChoice, PolicyChoice)
-
-
-def suite_from_dict(data: Mapping[str, Any], name: str = "suite") -> Suite:
-    """A suite from the values of a TOML file.
-
-    Raises:
-        ValueError: If a key is unknown, one that is needed is missing, or a value is not allowed.
-    """
-    known = [entry.name for entry in fields(Suite)]
-    for key in data:
-        if key not in (*known, "description"):
-            raise ValueError(unknown_name(f"key of suite {name!r}:", key, known))
-    for key in ("envs", "policies"):
-        if key not in data:
-            raise ValueError(f'suite {name!r} needs {key}: a list of tables, or "all"')
-    given = {key: value for key, value in data.items() if key != "description"}
-    given["envs"] = _choices(EnvChoice, "id", data["envs"], list(TRACKING), list(TEAMS), name)
-    policies = list(TRACKING_POLICIES), [key for key in TEAM_POLICIES if key not in TRACKING_POLICIES]
-    given["policies"] = _choices(PolicyChoice, "name", data["policies"], *policies, name)
-    return Suite(**{"name": name, **given})
-
-
-def _choices(
-    kind: type[_Choice], key: str, entries: Any, every: Sequence[str], more: Sequence[str], suite: str
-) -> tuple[_Choice, ...]:
-    """The tables of a list, or every name; `more` are names that "all" leaves out."""
-    if entries == "all":
-        entries = [{key: name} for name in every]
-    if not isinstance(entries, Sequence) or isinstance(entries, str):
-        raise ValueError(
-            f'suite {suite!r}: choose from a list of tables with {key!r}, or "all"; got {entries!r}'
+    @classmethod
+    def from_dict(cls, plain: Mapping[str, Any]) -> Suite:
+        """What `to_dict` gave, unchecked: its policies may be folders that are no longer there."""
+        policies = (
+            PolicyChoice(
+                **{**one, "train": one["train"] and Training(**one["train"]), "envs": tuple(one["envs"])}
+            )
+            for one in plain["policies"]
         )
-    out, known = [], [entry.name for entry in fields(kind)]
-    for entry in entries:
-        if not isinstance(entry, str | Mapping):
-            raise ValueError(f"suite {suite!r}: choose by name or by a table with {key!r}, got {entry!r}")
-        table: dict[str, Any] = {key: entry} if isinstance(entry, str) else dict(entry)
-        for name in table:
-            if name not in known:
-                raise ValueError(unknown_name(f"key in suite {suite!r}:", name, known))
-        if key not in table:
-            raise ValueError(f"suite {suite!r}: each table needs {key!r}, got {table}")
-        if table[key] not in (*every, *more):
-            raise ValueError(unknown_name(f"{key} in suite {suite!r}:", table[key], [*every, *more]))
-        if not isinstance(table.get("kwargs", {}), Mapping):
-            raise ValueError(
-                f"suite {suite!r}: kwargs of {table[key]!r} must be a table, as {{horizon = 15}}, "
-                f"got {table['kwargs']!r}"
-            )
-        if not isinstance(table.get("label", ""), str):
-            raise ValueError(
-                f"suite {suite!r}: the label of {table[key]!r} must be text, got {table['label']!r}"
-            )
-        if "envs" in table:
-            table["envs"] = _names(table["envs"], table[key], suite)
-        out.append(kind(**table))
-    return tuple(out)
-
-
-def _names(value: Any, policy: str, suite: str) -> tuple[str, ...]:
-    """The environments of a policy."""
-    if not isinstance(value, list | tuple) or not value or not all(isinstance(name, str) for name in value):
-        raise ValueError(
-            f"suite {suite!r}: envs of {policy!r} must be a list of ids or labels, got {value!r}; without "
-            "it the policy flies everywhere"
-        )
-    return tuple(value)
-
-
-def suite_names() -> dict[str, str]:
-    """Shipped suites and what they are."""
-    files = sorted(resources.files("baselines").joinpath("suites").iterdir(), key=lambda file: file.name)
-    toml = [file for file in files if file.name.endswith(".toml")]
-    return {
-        file.name[:-5]: str(tomllib.loads(file.read_text("utf-8")).get("description", "")) for file in toml
-    }
-
-
-def load_suite(source: str | Path | Mapping[str, Any] | Suite) -> Suite:
-    """A shipped suite by name, one from a TOML file, from a mapping, or as it is.
-
-    Raises:
-        ValueError: If it does not exist or is not valid.
-    """
-    if isinstance(source, Suite):
-        return source
-    if isinstance(source, Mapping):
-        return suite_from_dict(source)
-    path = Path(source)
-    if path.suffix == ".toml":
-        if not path.is_file():
-            raise ValueError(
-                f"there is no suite file {str(path)!r}; shipped suites: {', '.join(suite_names())}"
-            )
-        return _read_suite(path)
-    if str(source) not in suite_names():
-        raise ValueError(unknown_name("suite", str(source), suite_names()) + "; or the path of a .toml file")
-    text = resources.files("baselines").joinpath("suites", f"{source}.toml").read_text("utf-8")
-    return suite_from_dict(tomllib.loads(text), path.stem)
-
-
-def _read_suite(path: Path) -> Suite:
-    """The suite of a file; every complaint names the file."""
-    try:
-        return suite_from_dict(tomllib.loads(path.read_text("utf-8")), path.stem)
-    except OSError as error:
-        raise ValueError(f"cannot read suite file {str(path)!r}: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"suite file {str(path)!r} is not valid TOML: {error}") from error
-    except ValueError as error:
-        raise ValueError(f"suite file {str(path)!r}: {error}") from error
-
-
-class Unit(NamedTuple):
-    """What is flown in one piece."""
-
-    number: int
-    env: EnvChoice
-    policy: PolicyChoice
-    episodes: int
-    seed: int
-    episode_folder: Path | None  # where to save flights
-    flights_saved: int = 0  # how many, the first ones
-
-    @property
-    def file_name(self) -> str:
-        """Name of its file in cells/."""
-        slug = "".join(c if c.isalnum() else "-" for c in f"{self.env.title}--{self.policy.title}")
-        return f"{self.number:03d}-{slug[:80]}.json"
-
-    def episode_file(self, seed: int) -> Path | None:
-        """File of the flight with a seed; None if it is not saved."""
-        if self.episode_folder is None or seed >= self.seed + self.flights_saved:
-            return None
-        return self.episode_folder / f"{self.file_name.removesuffix('.json')}-{seed}.npz"
-
-    def episode_files(self) -> list[Path]:
-        """Files of its flights that are saved."""
-        files = (self.episode_file(self.seed + i) for i in range(self.episodes))
-        return [file for file in files if file is not None]
-
-
-def suite_units(suite: Suite, episode_folder: Path | None = None, flights_saved: int = 0) -> list[Unit]:
-    """All environments x policies that are for them; the first `flights_saved` flights go to the folder."""
-    pairs = [(env, policy) for env in suite.envs for policy in suite.policies if policy.flies_in(env)]
-    return [
-        Unit(i, env, policy, suite.episodes, suite.seed, episode_folder, flights_saved)
-        for i, (env, policy) in enumerate(pairs)
-    ]
+        conditions = (Condition(**{**one, "envs": tuple(one["envs"])}) for one in plain["conditions"])
+        envs = (EnvChoice(**env) for env in plain["envs"])
+        parts = {"envs": tuple(envs), "policies": tuple(policies), "conditions": tuple(conditions)}
+        return cls(**{**plain, **parts})

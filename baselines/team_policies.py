@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_envs.tasks import TeamTask
 
+from .checks import require_whole
 from .policy import N_FALLBACKS, Actions, PolicyState
 from .rows import as_rows, as_starts, not_finite, state_of
 
@@ -107,8 +108,7 @@ class TeamRandom(TeamPolicy):
     """
 
     def __init__(self, task: TeamTask, seed: int = 0) -> None:
-        if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-            raise ValueError(f"seed must be a whole number >= 0, got {seed!r}")
+        require_whole("seed", seed, 0)
         super().__init__(task, "random", 2)  # stream of the episode, step
         self._seed = int(seed)
 

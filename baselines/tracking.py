@@ -15,6 +15,7 @@ from quad_envs.observations import N_OWN, N_REFERENCE, decode_own
 from quad_envs.parameters import Array
 from quad_envs.tasks import Task
 
+from .checks import require_whole
 from .policy import N_FALLBACKS, Actions, Counts, PolicyState
 from .rows import as_rows, as_starts, first_not_finite, not_finite, state_of
 
@@ -213,8 +214,7 @@ class Random:
     memory_size = 2  # stream of the episode, step
 
     def __init__(self, task: Task, seed: int = 0) -> None:
-        if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-            raise ValueError(f"seed must be a whole number >= 0, got {seed!r}")
+        require_whole("seed", seed, 0)
         self._seed, self._hover, self._force_max = int(seed), float(task.hover_force), float(task.force_max)
 
     def decide(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,30 @@ def shipped_policies() -> dict[str, str]:
 def _describe(path: Path) -> str:
     said = json.loads(path.read_text(encoding="utf-8"))
     return f"{said['algorithm']} ({said['kind']}) on {said['env_id']}, score {said['score']:.3f}"
+
+
+@cache
+def _shipped_for() -> dict[tuple[str, str], str]:
+    """(algorithm, environment id) -> name."""
+    files = SHIPPED.glob(f"*/{_DESCRIPTION}")
+    said = {path.parent.name: json.loads(path.read_text("utf-8")) for path in files}
+    return {(entry["algorithm"], entry["env_id"]): name for name, entry in sorted(said.items())}
+
+
+def shipped_name(algorithm: str, env_id: str) -> str:
+    """Name of the shipped policy of an algorithm for a task.
+
+    Raises:
+        ValueError: If none is shipped.
+    """
+    known, env_id = _shipped_for(), env_id.removeprefix("quad_envs:")
+    if (algorithm, env_id) not in known:
+        tasks = [task for name, task in known if name == algorithm]
+        raise ValueError(
+            f"no policy of {algorithm!r} is shipped for {env_id}; there are some for: "
+            f"{', '.join(tasks) if tasks else 'no task'}"
+        )
+    return known[algorithm, env_id]
 
 
 def names_trained(name: str | os.PathLike[str]) -> bool:

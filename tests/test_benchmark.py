@@ -19,7 +19,7 @@ from baselines import Results, ResultsError, Suite, load_suite, run_benchmark
 from baselines.evaluation import Evaluation
 from baselines.policy import TRACKING_POLICIES
 from baselines.results import locked, plain_json, write_atomic, write_csv
-from baselines.suite import suite_names
+from baselines.suite_files import suite_names
 from quad_envs.registration import TRACKING
 
 SMALL = {

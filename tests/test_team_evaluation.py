@@ -19,8 +19,9 @@ from baselines.estimate_wrapper import EstimateWrapper
 from baselines.evaluation import Evaluation
 from baselines.metrics import Record, estimate, paired_difference, summarize, totals
 from baselines.policy import Estimates, PolicyState
-from baselines.suite import suite_from_dict, suite_units
+from baselines.suite_files import suite_from_dict
 from baselines.team_metrics import TEAM_COLUMNS, flight_values
+from baselines.units import suite_units
 from quad_envs import cooperative_estimation_v0, formation_v0, target_tracking_v0
 from quad_envs.registration import TEAMS
 from quad_envs.tasks import TeamTask

@@ -5,12 +5,11 @@ import io
 import json
 import signal
 import time
-from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 from processes import start_command
+from stub_training import stubs  # noqa: F401
 
 from baselines import CheckpointError, ResultsError, TrainingError, evaluate, make_policy, train
 from baselines.__main__ import main
@@ -18,8 +17,8 @@ from baselines.errors import MissingPackageError
 from baselines.options import TrainOptions
 from baselines.results import locked
 from baselines.train_command import resume_command
-from baselines.training import Network, load_checkpoint, networks
-from baselines.training.algorithms import ALGORITHMS, Algorithm, options_of
+from baselines.training import load_checkpoint
+from baselines.training.algorithms import ALGORITHMS, options_of
 from baselines.training.clock import Budget
 from baselines.training.held_out import CHOOSING, Point, better, training_options
 from baselines.training.hyperparameters import hyperparameter_file, hyperparameters
@@ -28,60 +27,6 @@ from quad_envs.registration import TEAMS, TRACKING
 
 HELIX = "quad/HelixTracking-v0"
 SHORT = {"time_limit": 1.0}  # 20 steps
-
-
-@dataclass(frozen=True, slots=True)
-class StubOptions:
-    """Of the stub."""
-
-    gain: float = 1.0
-    hidden: tuple[int, ...] = (4,)
-    rows: int = 100
-    fails_at: int = 0
-    how: str = ""
-
-
-class Progress(NamedTuple):
-    update: int
-    steps: int
-    reward: float
-
-
-def stub(task_options, options, seed, spent, start=None):
-    """Each update draws another network around hover; after `fails_at` of them something happens."""
-    task, rng, update = task_options.make_task(), np.random.default_rng(seed), 0
-    features = networks.default_features(task.layout)
-    while spent() < 1.0:
-        update += 1
-        if update == options.fails_at:
-            if options.how == "interrupt":
-                raise KeyboardInterrupt
-            if options.how == "training":
-                raise TrainingError("the loss is nan")
-        bias = np.full(4, np.nan if options.how == "nan" and update == options.fails_at else 0.0)
-        bias += options.gain * rng.normal(size=4) / (1 + update)
-        weights = np.zeros((len(features.names), 4), np.float32)
-        reward = np.inf if options.how == "infinite" and update == options.fails_at else 0.5
-        yield (
-            Progress(update, options.rows * update, reward),
-            Network(features, (weights,), (bias.astype(np.float32),)),
-        )
-        if start is not None:
-            assert len(start.weights) == 1
-
-
-def once_only(task_options, options, seed, spent):
-    """The same, and it cannot go on."""
-    return stub(task_options, options, seed, spent)
-
-
-@pytest.fixture(autouse=True)
-def stubs(monkeypatch):
-    entry = Algorithm(
-        __name__, "stub", "StubOptions", "imitation", ("tracking", "formation"), "a stub", 2.0, ()
-    )
-    monkeypatch.setitem(ALGORITHMS, "stub", entry)
-    monkeypatch.setitem(ALGORITHMS, "once", entry._replace(generator="once_only"))
 
 
 def run(out, steps=1000, **changes):

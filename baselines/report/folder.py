@@ -13,8 +13,9 @@ from baselines.errors import ResultsError
 from baselines.evaluation import Evaluation
 from baselines.metrics import Record
 from baselines.results import RESULTS_FORMAT, plain_json, read_json
-from baselines.suite import EnvChoice, PolicyChoice, Suite, Unit, suite_units
+from baselines.suite import EnvChoice, Suite
 from baselines.team_metrics import by_flight
+from baselines.units import Unit, suite_units
 from quad_envs.constraints import TOLERANCE
 from quad_envs.tasks import BaseTask, TeamTask
 
@@ -44,7 +45,8 @@ class Run(NamedTuple):
     def environments(self) -> list[tuple[EnvChoice, Results, list[Finished]]]:
         """Environments of which something is flown, each with its table and its units."""
         out = []
-        for env in self.suite.envs:
+        flown = [one for env in self.suite.envs for one in self.suite.flown(env).values()]
+        for env in flown:
             here = [one for one in self.finished if one.unit.env.title == env.title]
             if here:
                 out.append((env, _results(self.suite, env, here), here))
@@ -88,7 +90,7 @@ def read_run(folder: Path) -> Run:
     config = read_json(folder / "config.json")
     _check_format(folder, config)
     try:
-        suite = _suite(config["suite"])
+        suite = Suite.from_dict(config["suite"])
     except (KeyError, TypeError, ValueError) as error:
         raise ResultsError(f"the suite in {str(folder / 'config.json')!r} is not valid: {error}") from error
     units = suite_units(suite, folder / "episodes", suite.episodes)
@@ -103,15 +105,6 @@ def read_run(folder: Path) -> Run:
             "goes on where it stopped"
         )
     return Run(folder, config, suite, finished, len(units))
-
-
-def _suite(plain: Mapping[str, Any]) -> Suite:
-    """What `Suite.to_dict` gave; its policies may be folders that are no longer there."""
-    envs = tuple(EnvChoice(**env) for env in plain["envs"])
-    policies = tuple(
-        PolicyChoice(**{**policy, "envs": tuple(policy["envs"])}) for policy in plain["policies"]
-    )
-    return Suite(**{**plain, "envs": envs, "policies": policies})
 
 
 def _check_format(folder: Path, config: Any) -> None:

@@ -69,7 +69,7 @@ class RunFolder:
                 shutil.rmtree(self.path / name, ignore_errors=True)
         self.write_config([])
 
-    def resume(self) -> tuple[Network, dict[str, Any], list[Point]]:
+    def read(self) -> tuple[Network, dict[str, Any], list[Point]]:
         """The last network, what policy.json says of it, and the curve so far.
 
         Raises:
@@ -90,8 +90,12 @@ class RunFolder:
                 f"asked for is {json.dumps(asked.get(name))}; give the same, or choose another folder"
             )
         network, described = load_checkpoint(self.last)
-        self.write_config([*found.get("commands", []), found.get("command")])
         return network, described, self.read_curve()
+
+    def note_session(self) -> None:
+        """Say in config.json that the run goes on, by which command."""
+        found = self._config() or {}
+        self.write_config([*found.get("commands", []), found.get("command")])
 
     def save_best(self, network: Network, about: Mapping[str, Any]) -> None:
         """Write the best policy."""

@@ -6,27 +6,24 @@ Nothing here knows an algorithm: each is a generator, see `algorithms`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import CheckpointError, ResultsError, TrainingError
-from ..policy import mission_of
 from ..results import locked
-from .algorithms import ALGORITHMS, algorithm_for, generator_of, require_packages, resumable
-from .clock import Budget, TrainingClock
-from .command_line import assignments, training_command
-from .held_out import CHOOSING, HeldOutFlights, Point, better, read_point, training_options
-from .hyperparameters import hyperparameters, plain_options
+from .algorithms import generator_of, resumable
+from .clock import TrainingClock
+from .held_out import CHOOSING, HeldOutFlights, Point, better
 from .networks import Network
+from .plans import Plan, Start, make_plan, read_start
 from .run_folder import RunFolder
 from .watching import Watcher, tensorboard_log
 
 _EVALUATIONS = 30  # in a budget
 _PAUSE = 0.5  # CPU-seconds between evaluations, at least, in a budget of seconds
-_SEEDS = 5_000  # training seeds lie below; rows of a vector environment count on from there
 _LIMIT = "limit"  # hyperparameter that bounds the share of violating steps
 
 
@@ -51,18 +48,6 @@ class TrainingResult:
             "best": self.best._asdict(),
             "curve": [point._asdict() for point in self.curve],
         }
-
-
-class _Start(NamedTuple):
-    """From where a training goes on; all zero for a new one."""
-
-    network: Network | None = None
-    seconds: float = 0.0
-    steps: int = 0
-    updates: int = 0
-    resumed: int = 0  # times
-    curve: tuple[Point, ...] = ()
-    best: Point | None = None
 
 
 def default_folder(env_id: str, algorithm: str, seed: int) -> Path:
@@ -92,7 +77,7 @@ def train(
 
     Args:
         env_id: Id of the task.
-        algorithm: One of `ALGORITHMS`.
+        algorithm: One of `algorithms.ALGORITHMS`.
         seed: Of everything random, 0 to 4 999.
         seconds: Budget in CPU-seconds, without compilation and evaluation; the algorithm's own if neither
             this nor `steps` is given.
@@ -113,84 +98,39 @@ def train(
         CheckpointError: If a policy cannot be written or read.
         TrainingError: If training diverges; the last good policies are kept.
     """
-    _check_seed(seed)
     if resume and fresh:
         raise ValueError("either resume or fresh: a run that is discarded cannot go on")
-    kwargs = dict(env_kwargs or {})
-    task_options = training_options(env_id, kwargs)
-    entry = algorithm_for(algorithm, mission_of(task_options.make_task()))
-    budget = Budget(entry.seconds if seconds is None and steps is None else seconds, steps)
-    require_packages(algorithm)
-    env_id = env_id.removeprefix("quad_envs:")
-    options = hyperparameters(algorithm, env_id, hyper)
+    plan = make_plan(
+        env_id, algorithm, seed=seed, seconds=seconds, steps=steps, env_kwargs=env_kwargs, hyper=hyper
+    )
     path = default_folder(env_id, algorithm, seed) if out is None else Path(out)
-    texts = assignments(kwargs), assignments(hyper or {})
-    about = {
-        "env_id": env_id,
-        "env_kwargs": {key: value if _is_plain(value) else repr(value) for key, value in kwargs.items()},
-        "mission": mission_of(task_options.make_task()),
-        "algorithm": algorithm,
-        "kind": entry.kind,
-        "seed": seed,
-        "hyperparameters": plain_options(options),
-        "made_by": training_command(env_id, algorithm, seed, budget.seconds, budget.steps, "", *texts),
-    }
-    held_out = HeldOutFlights(env_id, kwargs)
+    held_out = HeldOutFlights(env_id, plan.env_kwargs)
     with locked(path):
-        folder = RunFolder(path, about)
+        folder = plan.folder(path)
         if resume:
-            start = _resume(folder, algorithm, budget)
+            start = _resume(folder, plan)
         else:
             folder.begin(fresh)
-            start = _Start()
-        run = _Run(folder, budget, held_out, start, getattr(options, _LIMIT, None), watcher)
-        run.go(algorithm, task_options, options, seed)
-        return TrainingResult(path, env_id, algorithm, seed, run.best_point(), tuple(run.curve))
+            start = Start()
+        run = _Run(folder, plan, held_out, start, watcher)
+        run.go()
+        return TrainingResult(path, plan.env_id, algorithm, seed, run.best_point(), tuple(run.curve))
 
 
-def _check_seed(seed: Any) -> None:
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < _SEEDS:
+def _resume(folder: RunFolder, plan: Plan) -> Start:
+    """Where the run in the folder goes on."""
+    if not resumable(plan.algorithm):
         raise ValueError(
-            f"seed of a training must be a whole number, 0 to {_SEEDS - 1}, got {seed!r}; later ones are "
-            "held out for evaluation"
+            f"{plan.algorithm!r} cannot go on from a saved network: its critic and its data are not saved; "
+            "train anew with a larger budget (--fresh)"
         )
-
-
-def _is_plain(value: Any) -> bool:
-    if isinstance(value, list | tuple):
-        return all(map(_is_plain, value))
-    if isinstance(value, dict):
-        return all(map(_is_plain, value.values()))
-    return value is None or isinstance(value, str | int | float)
-
-
-def _resume(folder: RunFolder, algorithm: str, budget: Budget) -> _Start:
-    """Where the run in the folder stands."""
-    if not resumable(algorithm):
-        raise ValueError(
-            f"{algorithm!r} cannot go on from a saved network: its critic and its data are not saved; train "
-            "anew with a larger budget (--fresh)"
-        )
-    network, said, curve = folder.resume()
-    try:
-        start = _Start(
-            network,
-            float(said["cpu_seconds"]),
-            int(said["steps"]),
-            int(said["updates"]),
-            int(said["resumed"]) + 1,
-            tuple(curve),
-            read_point(said["best"]),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise ResultsError(
-            f"{str(folder.last)!r} does not say how far the training was: {error!r}"
-        ) from error
-    if budget.share(start.seconds, start.steps) >= 1.0:
+    start = read_start(folder)
+    if plan.budget.share(start.seconds, start.steps) >= 1.0:
         raise ResultsError(
             f"{str(folder.path)!r} has used {start.seconds:.1f} CPU-seconds and {start.steps} steps, all of "
-            f"{budget}: give more, with --seconds or --steps for the whole run"
+            f"{plan.budget}: give more, with --seconds or --steps for the whole run"
         )
+    folder.note_session()
     return start
 
 
@@ -206,21 +146,10 @@ class _Run:
     """One session of training: turns the generator, judges now and then, saves."""
 
     def __init__(
-        self,
-        folder: RunFolder,
-        budget: Budget,
-        held_out: HeldOutFlights,
-        start: _Start,
-        limit: float | None,
-        watcher: Watcher | None,
+        self, folder: RunFolder, plan: Plan, held_out: HeldOutFlights, start: Start, watcher: Watcher | None
     ) -> None:
-        self.folder, self.budget, self.held_out, self.start, self.limit = (
-            folder,
-            budget,
-            held_out,
-            start,
-            limit,
-        )
+        self.folder, self.plan, self.budget, self.held_out = folder, plan, plan.budget, held_out
+        self.start, self.limit = start, getattr(plan.options, _LIMIT, None)
         self.curve: list[Point] = list(start.curve)
         self.best = start.best
         self.clock = TrainingClock(start.seconds)
@@ -236,13 +165,13 @@ class _Run:
         assert self.best is not None
         return self.best
 
-    def go(self, algorithm: str, task_options: Any, options: Any, seed: int) -> None:
+    def go(self) -> None:
         """Train until the budget is used up."""
-        more = {"start": self.start.network} if self.start.network is not None else {}
+        plan, more = self.plan, {} if self.start.network is None else {"start": self.start.network}
         # A resumed run draws other flights than those it has seen.
-        seed += 1_000_003 * self.start.resumed
+        seed = plan.seed + 1_000_003 * self.start.resumed
         with _one_thread():
-            updates = generator_of(algorithm)(task_options, options, seed, self.share, **more)
+            updates = generator_of(plan.algorithm)(plan.task_options, plan.options, seed, self.share, **more)
             self._watchers += tensorboard_log(self.folder.path / "tensorboard")
             try:
                 self._turn(updates)
@@ -252,7 +181,7 @@ class _Run:
         if self._unsaved is not None:
             raise self._unsaved
         if self.best is None:
-            raise TrainingError(f"{algorithm} made no update within {self.budget}; give it more")
+            raise TrainingError(f"{plan.algorithm} made no update within {self.budget}; give it more")
 
     def share(self) -> float:
         """Share of the budget that is used up."""
@@ -356,8 +285,3 @@ def _one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def algorithm_names() -> Sequence[str]:
-    """Names that `train` knows."""
-    return tuple(ALGORITHMS)

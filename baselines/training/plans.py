@@ -1,0 +1,125 @@
+"""What a training is to be, checked before anything is written; and how far one in a folder is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..errors import ResultsError
+from ..policy import mission_of
+from .algorithms import algorithm_for, require_packages
+from .clock import Budget
+from .command_line import assignments, training_command
+from .held_out import Point, read_point, training_options
+from .hyperparameters import hyperparameters, plain_options
+from .networks import Network
+from .run_folder import RunFolder
+
+_SEEDS = 5_000  # training seeds lie below; rows of a vector environment count on from there
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A training that can be done. `make_plan` makes it."""
+
+    env_id: str
+    env_kwargs: dict[str, Any]
+    algorithm: str
+    seed: int
+    budget: Budget
+    task_options: Any  # TrackingOptions or options of a team
+    options: Any  # hyperparameters
+    about: dict[str, Any]  # as config.json says it
+
+    def folder(self, path: Path) -> RunFolder:
+        """The folder of the run."""
+        return RunFolder(path, self.about)
+
+
+class Start(NamedTuple):
+    """From where a training goes on; all zero for a new one."""
+
+    network: Network | None = None
+    seconds: float = 0.0
+    steps: int = 0
+    updates: int = 0
+    resumed: int = 0  # times
+    curve: tuple[Point, ...] = ()
+    best: Point | None = None
+
+
+def make_plan(
+    env_id: str,
+    algorithm: str,
+    *,
+    seed: int = 0,
+    seconds: float | None = None,
+    steps: int | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+    hyper: Mapping[str, Any] | None = None,
+) -> Plan:
+    """A training, its arguments as those of `train`.
+
+    Raises:
+        ValueError: If an argument is not allowed or the algorithm cannot act on the task.
+        MissingPackageError: If what the algorithm needs is not installed.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < _SEEDS:
+        raise ValueError(
+            f"seed of a training must be a whole number, 0 to {_SEEDS - 1}, got {seed!r}; later ones are "
+            "held out for evaluation"
+        )
+    kwargs = dict(env_kwargs or {})
+    task_options = training_options(env_id, kwargs)
+    mission = mission_of(task_options.make_task())
+    entry = algorithm_for(algorithm, mission)
+    budget = Budget(entry.seconds if seconds is None and steps is None else seconds, steps)
+    require_packages(algorithm)
+    env_id = env_id.removeprefix("quad_envs:")
+    options = hyperparameters(algorithm, env_id, hyper)
+    texts = assignments(kwargs), assignments(hyper or {})
+    about = {
+        "env_id": env_id,
+        "env_kwargs": {key: value if _is_plain(value) else repr(value) for key, value in kwargs.items()},
+        "mission": mission,
+        "algorithm": algorithm,
+        "kind": entry.kind,
+        "seed": seed,
+        "hyperparameters": plain_options(options),
+        "made_by": training_command(env_id, algorithm, seed, budget.seconds, budget.steps, "", *texts),
+    }
+    return Plan(env_id, kwargs, algorithm, seed, budget, task_options, options, about)
+
+
+def _is_plain(value: Any) -> bool:
+    if isinstance(value, list | tuple):
+        return all(map(_is_plain, value))
+    if isinstance(value, dict):
+        return all(map(_is_plain, value.values()))
+    return value is None or isinstance(value, str | int | float)
+
+
+def read_start(folder: RunFolder) -> Start:
+    """Where the run in a folder stands.
+
+    Raises:
+        ResultsError: If there is no run, it is another one, or it does not say how far it was.
+        CheckpointError: If its last policy cannot be read.
+    """
+    network, said, curve = folder.read()
+    try:
+        return Start(
+            network,
+            float(said["cpu_seconds"]),
+            int(said["steps"]),
+            int(said["updates"]),
+            int(said["resumed"]) + 1,
+            tuple(curve),
+            read_point(said["best"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise ResultsError(
+            f"{str(folder.last)!r} does not say how far the training was: {error!r}"
+        ) from error
