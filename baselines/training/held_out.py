@@ -25,6 +25,14 @@ CHOOSING = 20_000  # the first of those that choose the best policy
 _FLIGHTS, _TEAM_FLIGHTS = 20, 5
 
 
+class Progress(NamedTuple):
+    """How far a training is."""
+
+    update: int
+    steps: int
+    reward: float  # mean of the last update, as the algorithm saw it; nan if not known
+
+
 class Point(NamedTuple):
     """A row of the learning curve."""
 
@@ -84,20 +92,27 @@ class HeldOutFlights:
             self.env = gymnasium.make_vec(name, num_envs=self.flights, **env_kwargs)
         self.task = self.env.unwrapped.task
 
-    def judge(self, network: Network, cpu_seconds: float, progress: Any) -> Point:
-        """Fly a network."""
-        found = evaluate(NetworkPolicy(network, self.task, "training"), self.env, self.flights, CHOOSING)
+    def judge(self, network: Network, cpu_seconds: float, progress: Progress, seed: int = CHOOSING) -> Point:
+        """Fly a network.
+
+        Args:
+            network: It.
+            cpu_seconds: That its training has taken.
+            progress: Of its training.
+            seed: Environment seed of the first flight.
+        """
+        found = evaluate(NetworkPolicy(network, self.task, "training"), self.env, self.flights, seed)
         summary = found.summary()
         return Point(
             cpu_seconds=cpu_seconds,
-            steps=int(progress.steps),
-            updates=int(progress.update),
+            steps=progress.steps,
+            updates=progress.update,
             score=summary["score"].mean,
             cost=summary["cost"].mean,
             violation_share=summary["violation_share"].mean,
             crashes=int(np.sum([record.crashed for record in found.records])),
             flights=len(found.records),
-            training_reward=float(progress.reward),
+            training_reward=progress.reward,
         )
 
 

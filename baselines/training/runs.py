@@ -10,13 +10,13 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ..errors import CheckpointError, ResultsError, TrainingError
 from ..results import locked
 from .algorithms import generator_of, resumable
 from .clock import TrainingClock
-from .held_out import CHOOSING, HeldOutFlights, Point, better
+from .held_out import CHOOSING, HeldOutFlights, Point, Progress, better
 from .networks import Network
 from .plans import Plan, Start, make_plan, read_start
 from .run_folder import RunFolder
@@ -134,14 +134,6 @@ def _resume(folder: RunFolder, plan: Plan) -> Start:
     return start
 
 
-class _Progress(NamedTuple):
-    """Of the whole run, earlier sessions included."""
-
-    update: int
-    steps: int
-    reward: float
-
-
 class _Run:
     """One session of training: turns the generator, judges now and then, saves."""
 
@@ -153,7 +145,7 @@ class _Run:
         self.curve: list[Point] = list(start.curve)
         self.best = start.best
         self.clock = TrainingClock(start.seconds)
-        self.progress = _Progress(start.updates, start.steps, math.nan)
+        self.progress = Progress(start.updates, start.steps, math.nan)
         self.network: Network | None = None  # the last one that is not saved yet
         self._judged = -math.inf  # CPU-seconds at the last evaluation
         self._next = 0.0  # share of the budget at which the next one is due
@@ -200,7 +192,7 @@ class _Run:
             if found is None:
                 return
             progress, self.network = found
-            self.progress = _Progress(
+            self.progress = Progress(
                 self.start.updates + progress.update,
                 self.start.steps + progress.steps,
                 float(progress.reward),
