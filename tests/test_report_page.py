@@ -1,0 +1,343 @@
+"""The report in a browser, headless Chromium: it plays, scrubs, sorts, compares, and loads nothing."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from importlib import resources
+
+import numpy as np
+import pytest
+
+from baselines import run_benchmark
+from baselines.report import Choice, read_run, render_report
+
+pytestmark = pytest.mark.slow
+
+playwright = pytest.importorskip("playwright.sync_api", reason="needs the playwright package")
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+FLAGS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+HELIX, CORRIDOR, TEAM = "quad/HelixTracking-v0", "quad/CorridorTracking-v0", "a team"
+EVIL = "</script><img src=x onerror=alert(1)>"
+SUITE = {
+    "name": "seen",
+    "episodes": 3,
+    "seed": 0,
+    "compare_with": "lqr",
+    "envs": [
+        CORRIDOR,
+        HELIX,
+        {"id": "quad/TargetTracking-v0", "kwargs": {"vehicles": 3, "formation": "triangle"}, "label": TEAM},
+    ],
+    "policies": [
+        {"name": "lqr", "envs": [CORRIDOR, HELIX]},
+        {"name": "feedback-linearization", "envs": [CORRIDOR, HELIX]},
+        {"name": "hover", "envs": [CORRIDOR, HELIX, TEAM], "label": EVIL},
+        {"name": "cooperative-mpc", "envs": [TEAM], "kwargs": {"horizon": 5}},
+    ],
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    found = tmp_path_factory.mktemp("page") / "run"
+    run_benchmark(SUITE, found)
+    return found
+
+
+@pytest.fixture(scope="module")
+def browser():
+    path = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if path is None:
+        pytest.skip("needs Chromium")
+    with playwright.sync_playwright() as running:
+        chromium = running.chromium.launch(executable_path=path, args=FLAGS)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def show(browser, folder):
+    """Opens a page file; at the end nothing was complained of and nothing was asked for."""
+    trouble, asked, contexts = [], [], []
+
+    def opened(path=folder / "report.html", width=1440, height=1000, **settings):
+        context = browser.new_context(viewport={"width": width, "height": height}, **settings)
+        contexts.append(context)
+        page = context.new_page()
+        page.set_default_timeout(15_000)
+        page.on("console", lambda said: trouble.append(f"{said.type}: {said.text}"))
+        page.on("pageerror", lambda error: trouble.append(str(error)))
+        page.on("dialog", lambda dialog: trouble.append(f"dialog: {dialog.message}"))
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto(path.as_uri())
+        page.wait_for_selector(".plot")
+        return page
+
+    yield opened
+    for context in contexts:
+        context.close()
+    ours = "willReadFrequently"  # advice to `ink`, which reads the canvas
+    assert [said for said in trouble if ours not in said] == []
+    assert {url.split(":")[0] for url in asked} <= {"file", "data"}
+    assert all(url.endswith(".html") for url in asked if url.startswith("file:"))
+
+
+def ink(page, selector="#panes canvas"):
+    """Number of painted pixels of the first canvas, and a sum that changes with the picture."""
+    return page.evaluate(
+        """(selector) => {
+        const canvas = document.querySelector(selector);
+        const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+        let [count, sum] = [0, 0];
+        for (let i = 0; i < data.length; i += 4) {
+          if (data[i + 3]) count += 1;
+          sum = (sum + (i % 8191) * (data[i] + 2 * data[i + 1] + 3 * data[i + 2] + data[i + 3])) % 1e9;
+        }
+        return [count, sum];
+        }""",
+        selector,
+    )
+
+
+def until(page, condition):
+    """Wait for a condition; Playwright's own way evaluates text in the page, which its policy forbids."""
+    for _ in range(300):
+        if page.evaluate(condition):
+            return
+        page.wait_for_timeout(50)
+    raise AssertionError(f"never came true: {condition}")
+
+
+def clock(page):
+    return float(page.locator("#clock").inner_text().split("/")[0])
+
+
+def test_the_first_environment_is_shown_with_two_policies_in_space_and_time(show):
+    page = show()
+    assert page.locator("#environments button[aria-current=true]").inner_text() == CORRIDOR
+    assert page.locator("#board tbody tr").count() == 3
+    assert page.locator(".chips button[aria-pressed=true]").count() == 2
+    titles = page.locator(".plot h3").all_inner_texts()
+    for what in ("Position error", "Rotor forces", "Attitude", "Limit: tilt", "Limit: rate", "Decision time"):
+        assert any(title.startswith(what) for title in titles), what
+    assert ink(page)[0] > 1000 and ink(page, ".plot canvas")[0] > 500
+
+
+def test_play_moves_the_clock_and_the_picture_and_pauses(show):
+    page = show()
+    before = ink(page)
+    page.locator("#play").click()
+    until(page, "Number(document.getElementById('scrub').value) > 0.2")
+    page.locator("#play").click()
+    stopped = clock(page)
+    assert ink(page) != before and stopped > 0.2
+    page.wait_for_timeout(200)
+    assert clock(page) == stopped
+
+
+def test_the_whole_viewer_is_used_by_keyboard(show):
+    page = show()
+    page.locator("#panes canvas").focus()
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowRight")
+    assert clock(page) == pytest.approx(0.1)
+    page.keyboard.press("ArrowLeft")
+    assert clock(page) == pytest.approx(0.05)
+    page.keyboard.press("End")
+    assert clock(page) > 0.05
+    page.keyboard.press("Home")
+    assert clock(page) == 0.0
+    before = ink(page)
+    page.keyboard.press("Shift+ArrowRight")
+    turned = ink(page)
+    page.keyboard.press("+")
+    assert before != turned != ink(page)
+    page.keyboard.press("Space")
+    until(page, "Number(document.getElementById('scrub').value) > 0.05")
+    page.keyboard.press("Space")
+    assert page.locator("#play").get_attribute("aria-label") == "Play"
+
+
+def test_scrubbing_moves_the_cursor_of_every_plot(show):
+    page = show()
+    page.locator("#scrub").fill("5")
+    assert clock(page) == pytest.approx(5.0)
+    moved = page.locator(".plot .cursor:not(.ghost)").evaluate_all(
+        "(lines) => lines.map((line) => line.style.transform)"
+    )
+    assert len(moved) > 4 and len(set(moved)) == 1 and moved[0] != "translateX(46px)"
+
+
+def test_hovering_a_plot_shows_its_values_and_pressing_seeks(show):
+    page = show()
+    field = page.locator(".plot .field").first
+    field.scroll_into_view_if_needed()
+    box = field.bounding_box()
+    page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 50)
+    tip = page.locator(".plot .tip").first
+    assert tip.evaluate("(tip) => tip.style.visibility") == "visible" and " s" in tip.inner_text()
+    assert page.locator(".cursor.ghost").nth(2).evaluate("(line) => line.style.visibility") == "visible"
+    assert clock(page) == 0.0
+    page.mouse.down()
+    page.mouse.up()
+    assert clock(page) > 1.0
+    page.mouse.move(5, 5)
+    assert tip.evaluate("(tip) => tip.style.visibility") == "hidden"
+
+
+def test_dragging_orbits_and_the_wheel_zooms(show):
+    page = show()
+    canvas = page.locator("#panes canvas")
+    canvas.scroll_into_view_if_needed()
+    box = canvas.bounding_box()
+    x, y = box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"]
+    standing = ink(page)
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 80, y + 20)
+    page.mouse.up()
+    turned = ink(page)
+    page.mouse.wheel(0, -300)
+    page.wait_for_timeout(100)
+    assert standing != turned != ink(page)
+    page.locator("#reset").click()
+    assert ink(page) == standing
+
+
+def test_up_in_the_world_is_up_on_the_screen_and_nothing_is_mirrored(show):
+    page = show()
+    source = resources.files("baselines.report").joinpath("page", "camera.js").read_text("utf-8")
+    centre, above, east = page.evaluate(  # through the debugger, whom the page's policy does not bind
+        """(source) => {
+        const camera = new (eval.call(null, source + "; Camera"))();
+        camera.fit([-1, -1, -1], [1, 1, 1]);
+        [camera.azimuth, camera.elevation] = [Math.PI, 0];
+        const project = camera.projector(400, 400);
+        return [[0, 0, 0], [0, 0, -0.5], [0, 0.5, 0]].map((point) => project(point));
+        }""",
+        source,
+    )
+    # From the south, looking north: up is up, and east is on the right.
+    assert above[1] < centre[1] - 10 and abs(above[0] - centre[0]) < 1
+    assert east[0] > centre[0] + 10 and abs(east[1] - centre[1]) < 1
+
+
+def test_the_leaderboard_sorts_by_click_and_by_keyboard(show):
+    page = show()
+    column = page.locator('th[data-key="effort"]')
+    index = page.locator("#board thead th").all_inner_texts().index(column.inner_text())
+
+    def values():
+        cells = page.locator(f"#board tbody tr > :nth-child({index + 1})").all_inner_texts()
+        return [float(cell.split("±")[0]) for cell in cells]
+
+    column.locator("button").click()
+    assert column.get_attribute("aria-sort") == "ascending" and values() == sorted(values())
+    column.locator("button").focus()
+    page.keyboard.press("Enter")
+    assert column.get_attribute("aria-sort") == "descending"
+    assert values() == sorted(values(), reverse=True)
+    assert page.locator('th[data-key="score"]').get_attribute("aria-sort") is None
+
+
+def test_policies_are_overlaid_or_stand_side_by_side_and_turn_together(show):
+    page = show()
+    page.locator("#environments button", has_text=HELIX).click()
+    until(page, "document.querySelectorAll('.chips button').length === 3")
+    assert page.locator("#panes canvas").count() == 1
+    page.get_by_role("button", name="Side by side").click()
+    until(page, "document.querySelectorAll('#panes canvas').length === 2")
+    one = ink(page, ".pane:nth-child(1) canvas"), ink(page, ".pane:nth-child(2) canvas")
+    page.locator("#panes canvas").first.focus()
+    page.keyboard.press("Shift+ArrowLeft")
+    two = ink(page, ".pane:nth-child(1) canvas"), ink(page, ".pane:nth-child(2) canvas")
+    assert one[0] != two[0] and one[1] != two[1]
+    page.locator(".chips button[aria-pressed=false]").click()
+    until(page, "document.querySelectorAll('#panes canvas').length === 3")
+
+
+def test_another_start_shows_another_flight(show):
+    page = show()
+    before = ink(page)
+    page.get_by_label("Start").first.select_option("1")
+    page.wait_for_timeout(300)
+    assert ink(page) != before
+
+
+def test_a_team_has_its_separation_its_estimates_and_their_honesty(show):
+    page = show()
+    page.locator("#environments button", has_text=TEAM).click()
+    until(page, "document.querySelector('.plot h3').textContent.startsWith('Formation error')")
+    titles = page.locator(".plot h3").all_inner_texts()
+    for what in ("Nearest vehicle", "Error of the estimated position", "NEES", "Limit: separation"):
+        assert any(title.startswith(what) for title in titles), what
+    page.get_by_label("View").select_option("target")
+    page.get_by_label("Plots of").select_option("1")
+    until(page, "document.querySelectorAll('.plot').length > 5")
+    assert "ellipsoids" in page.locator("#legend").inner_text()
+
+
+def test_the_page_is_dark_or_light_as_the_system_and_as_the_button_says(show):
+    def paper(page):
+        return page.evaluate("getComputedStyle(document.body).backgroundColor")
+
+    light, dark = show(color_scheme="light"), show(color_scheme="dark")
+    assert paper(light) == "rgb(255, 255, 255)" and paper(dark) == "rgb(18, 21, 26)"
+    light.locator("#theme").click()
+    assert paper(light) == paper(dark) and light.locator("#theme").inner_text() == "Light"
+
+
+def test_a_phone_sees_the_whole_width_and_only_the_table_scrolls(show):
+    page = show(width=390, height=844, has_touch=True, is_mobile=True)
+    assert page.evaluate("document.documentElement.scrollWidth") == 390
+    assert page.evaluate("document.getElementById('board').scrollWidth") > 390
+    small = page.evaluate(
+        "[...document.querySelectorAll('.transport button, .chips button, .choices select')]"
+        ".filter((part) => part.offsetParent && part.getBoundingClientRect().height < 32).length"
+    )
+    assert small == 0
+
+
+def test_names_are_shown_as_they_are(show):
+    page = show()
+    assert EVIL in page.locator("#board tbody").inner_text()
+    assert page.locator("#board img").count() == 0
+
+
+def test_a_replay_opens_on_its_flight(show, folder, tmp_path):
+    path = tmp_path / "replay.html"
+    path.write_text(render_report(read_run(folder), Choice(env=TEAM, policy=EVIL, seed=1)), "utf-8")
+    page = show(path)
+    assert page.locator(".chips button[aria-pressed=true]").inner_text().startswith(EVIL)
+    assert page.get_by_label("Start").first.input_value() == "1"
+
+
+def test_a_flight_that_ended_in_its_first_step_is_shown(show, folder, tmp_path):
+    copy = tmp_path / "run"
+    shutil.copytree(folder, copy)
+    run = read_run(copy)
+    one = run.finished[0]
+    path = one.unit.episode_file(0)
+    with np.load(path) as file:
+        arrays = {key: file[key] for key in file.files}
+    rows = {"states": 2, "references": 2, "fallbacks": None}
+    np.savez(path, **{key: value[: rows.get(key, 1)] for key, value in arrays.items()})
+    cell_path = copy / "cells" / one.unit.file_name
+    cell = json.loads(cell_path.read_text())
+    cell["found"]["records"][0] |= {"crashed": True, "steps": 1}
+    cell_path.write_text(json.dumps(cell))
+    page_path = tmp_path / "page.html"
+    title = one.unit.policy.title
+    page_path.write_text(render_report(read_run(copy), Choice(policy=title, seed=0)), "utf-8")
+    page = show(page_path)
+    assert page.locator("#clock").inner_text() == "0.00 / 0.05 s"
+    page.keyboard.press("End")
+    assert clock(page) == 0.05
