@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
+import threading
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,6 +21,7 @@ from .scenes import project
 
 Colour = tuple[int, int, int]
 Floats = NDArray[np.float32]
+Words = NDArray[np.uint32]
 Flat = list[float]  # x, y, x, y, ... in canvas pixels
 
 # Okabe and Ito's colours, which stay apart for colour-blind eyes; red is for violations alone.
@@ -51,8 +53,26 @@ def mix(colour: Colour, other: Colour, share: float) -> Colour:
     return r, g, b
 
 
+class _Memory(threading.local):
+    """Pixels of the last canvas of this thread: new memory of this size costs more than the drawing."""
+
+    def __init__(self) -> None:
+        self._pixels = np.empty((0, 0, 4), dtype=np.uint8)
+
+    def pixels(self, width: int, height: int) -> NDArray[np.uint8]:
+        """(height, width, 4), with what was drawn before."""
+        if self._pixels.shape[:2] != (height, width):
+            self._pixels = np.empty((height, width, 4), dtype=np.uint8)
+        return self._pixels
+
+
+_MEMORY = _Memory()
+
+
 class Canvas:
     """An image in the making; positions are NED, m, unless they are called pixels.
+
+    A thread finishes one canvas before it begins the next: they share their memory.
 
     Args:
         width: Of the finished picture, pixels.
@@ -66,7 +86,7 @@ class Canvas:
 
         self.width, self.height = width, height
         size = OVERSAMPLING * width, OVERSAMPLING * height
-        self._pixels = np.empty((size[1], size[0], 4), dtype=np.uint8)
+        self._pixels = _MEMORY.pixels(*size)
         self._pixels.view(np.uint32).fill(np.array((*PAPER, 255), dtype=np.uint8).view(np.uint32)[0])
         # Pillow draws into our memory; an image made that way is read-only until told otherwise.
         self.image = Image.frombuffer("RGBX", size, self._pixels, "raw", "RGBX", 0, 1)
@@ -138,7 +158,7 @@ class Canvas:
     def finish(self) -> NDArray[np.uint8]:
         """The picture, (height, width, 3)."""
         frame = np.empty((self.height, self.width, 3), dtype=np.uint8)
-        halve(self._pixels.view(np.uint32)[..., 0], self._pixels, frame)
+        halve(self._pixels.view(np.uint32)[..., 0], np.empty(self.width, dtype=np.uint32), frame)
         for x, y, what, size, colour, anchor in self._texts:
             keep, add, left, top = _stencil(what, size, colour, anchor)
             left, top = round(x) + left, round(y) + top
@@ -176,22 +196,25 @@ def _stencil(what: str, size: int, colour: Colour, anchor: str) -> tuple[Floats,
 
 
 @kernel
-def halve(words: NDArray[np.uint32], channels: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
-    """Mean of each block of four pixels, rounded; most blocks are of one colour.
+def halve(words: Words, row: Words, out: NDArray[np.uint8]) -> None:
+    """Mean of each block of four pixels, rounded.
+
+    Every second channel is summed at once: four of 8 bits and 2 for rounding fit into 16.
 
     Args:
-        words: Pixels (2 h, 2 w) as one number each.
-        channels: The same memory, (2 h, 2 w, 4).
+        words: Pixels (2 h, 2 w), their channels from the low byte on.
+        row: Scratch, (w,).
         out: Result, (h, w, 3).
     """
+    mask, half, eight, two = np.uint32(0x00FF00FF), np.uint32(0x00020002), np.uint32(8), np.uint32(2)
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             a, b = words[2 * i, 2 * j], words[2 * i, 2 * j + 1]
-            plain = a == b and a == words[2 * i + 1, 2 * j] and a == words[2 * i + 1, 2 * j + 1]
-            for c in range(3):
-                if plain:
-                    out[i, j, c] = channels[2 * i, 2 * j, c]
-                else:
-                    upper = np.uint16(channels[2 * i, 2 * j, c]) + channels[2 * i, 2 * j + 1, c]
-                    lower = np.uint16(channels[2 * i + 1, 2 * j, c]) + channels[2 * i + 1, 2 * j + 1, c]
-                    out[i, j, c] = (upper + lower + 2) >> 2
+            c, d = words[2 * i + 1, 2 * j], words[2 * i + 1, 2 * j + 1]
+            even = (a & mask) + (b & mask) + (c & mask) + (d & mask) + half
+            odd = (a >> eight & mask) + (b >> eight & mask) + (c >> eight & mask) + (d >> eight & mask) + half
+            row[j] = (even >> two & mask) | ((odd >> two & mask) << eight)
+        for j in range(out.shape[1]):
+            out[i, j, 0] = row[j] & np.uint32(255)
+            out[i, j, 1] = row[j] >> eight & np.uint32(255)
+            out[i, j, 2] = row[j] >> np.uint32(16) & np.uint32(255)
