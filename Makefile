@@ -1,12 +1,15 @@
 # make demo   install into .venv, fly every tracking baseline on the helix and write a page of it (needs Python and pip)
 # make test   install the development extras and run ruff, mypy and the tests
 # make slow   the tests that take longer: dissertation tables, other solvers, long flights
+# make rllib  install RLlib into .venv-rllib (it pins an older gymnasium) and train a formation on a local Ray
+# make ray    fly the quick benchmark on joblib's Ray backend, in the same environment
 PYTHON ?= python3
 VENV ?= .venv
+RLLIB ?= .venv-rllib
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 
-.PHONY: demo test slow clean
+.PHONY: demo test slow rllib ray clean
 
 demo: $(VENV)/installed
 	$(BIN)/quad-envs benchmark quick --fresh --out runs/demo
@@ -21,6 +24,18 @@ test: $(VENV)/installed-dev
 slow: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m slow
 
+rllib: $(RLLIB)/installed
+	$(RLLIB)/bin/python -m examples.rllib_formation
+
+ray: $(RLLIB)/installed
+	$(RLLIB)/bin/quad-envs benchmark quick --engine ray --jobs 2 --fresh --out runs/ray
+
+$(RLLIB)/installed: pyproject.toml constraints.txt examples/constraints-rllib.txt
+	$(PYTHON) -m venv $(RLLIB)
+	$(RLLIB)/bin/python -m pip --disable-pip-version-check -q install -c examples/constraints-rllib.txt torch
+	$(RLLIB)/bin/python -m pip --disable-pip-version-check -q install -c examples/constraints-rllib.txt -e . "ray[rllib]"
+	touch $@
+
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) install -c constraints.txt -e .
@@ -32,4 +47,4 @@ $(VENV)/installed-dev: $(VENV)/installed
 	touch $@
 
 clean:
-	rm -rf $(VENV) build *.egg-info
+	rm -rf $(VENV) $(RLLIB) build *.egg-info
