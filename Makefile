@@ -2,14 +2,16 @@
 # make test   install the development extras and run ruff, mypy and the tests
 # make slow   the tests that take longer: dissertation tables, other solvers, long flights
 # make rllib  install RLlib into .venv-rllib (it pins an older gymnasium) and train a formation on a local Ray
+# make test-rllib  conformance with that gymnasium, and the example, in that environment
 # make ray    fly the quick benchmark on joblib's Ray backend, in the same environment
 PYTHON ?= python3
 VENV ?= .venv
 RLLIB ?= .venv-rllib
 BIN := $(VENV)/bin
+RLLIB_PIP := $(RLLIB)/bin/python -m pip --disable-pip-version-check -q install -c examples/constraints-rllib.txt
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 
-.PHONY: demo test slow rllib ray clean
+.PHONY: demo test slow rllib test-rllib ray clean
 
 demo: $(VENV)/installed
 	$(BIN)/quad-envs benchmark quick --fresh --out runs/demo
@@ -27,13 +29,16 @@ slow: $(VENV)/installed-dev
 rllib: $(RLLIB)/installed
 	$(RLLIB)/bin/python -m examples.rllib_formation
 
+test-rllib: $(RLLIB)/installed
+	$(RLLIB)/bin/python -m pytest -m "slow or not slow" tests/test_registry.py tests/test_examples.py
+
 ray: $(RLLIB)/installed
 	$(RLLIB)/bin/quad-envs benchmark quick --engine ray --jobs 2 --fresh --out runs/ray
 
 $(RLLIB)/installed: pyproject.toml constraints.txt examples/constraints-rllib.txt
 	$(PYTHON) -m venv $(RLLIB)
-	$(RLLIB)/bin/python -m pip --disable-pip-version-check -q install -c examples/constraints-rllib.txt torch
-	$(RLLIB)/bin/python -m pip --disable-pip-version-check -q install -c examples/constraints-rllib.txt -e . "ray[rllib]"
+	$(RLLIB_PIP) torch
+	$(RLLIB_PIP) -e . "ray[rllib]" pytest
 	touch $@
 
 $(VENV)/installed: pyproject.toml constraints.txt
