@@ -1,6 +1,7 @@
 """`quad-envs certify`: verdicts along short flights, figures, and bad input."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -114,7 +115,7 @@ def test_the_ellipse_of_a_shape_satisfies_its_equation():
 
 
 def test_without_matplotlib_the_message_names_the_extra(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "matplotlib", None)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(MissingPackageError, match=r"quad-envs\[report\]"), house_style():
         pass
 
@@ -142,6 +143,12 @@ def test_what_cannot_be_certified_is_refused_in_one_line(capsys, arguments, mess
     assert main(["certify", *arguments]) == 2
     out, err = capsys.readouterr()
     assert message in err and out == "" and err.count("\n") == 1
+
+
+def test_without_matplotlib_the_command_says_so_before_it_flies(capsys, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert main(["certify", REGULATION, "lmpc", "--out", str(tmp_path / "out")]) == 2
+    assert "quad-envs[report]" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 from ..commands import plain_warnings, progress, say
+from ..figures import house_style
 from ..options import CertifyOptions, read_assignments
 from ..results import provenance, write_json
 from . import certify
@@ -17,6 +18,9 @@ def certify_one(options: CertifyOptions) -> int:
     """Certify one policy, print the verdicts, and leave figures where asked."""
     env_kwargs = read_assignments("--set", options.set)
     policy_kwargs = read_assignments("--policy-set", options.policy_set)
+    if options.out is not None:
+        with house_style():  # without matplotlib this fails now, and not after the flights
+            options.out.mkdir(parents=True, exist_ok=True)
     with plain_warnings(), progress(_PARTS, "part") as bar:
         report = certify(
             options.env,

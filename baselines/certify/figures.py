@@ -57,12 +57,12 @@ def value_figure(trace: Trace, title: str) -> Any:
         top.set_yscale("log")
     top.set_title(f"{title}: value function along the flight")
     top.set_ylabel("cost")
-    top.legend()
+    _legend(top)
     found = descent(trace)
     lines = (
-        ("following", "as the next sample poses its problem", "purple", 2.2),
-        ("plant", "from where the plant came to be", "orange", 1.2),
-        ("model", "if the model of the sample is right", "blue", 1.2),
+        ("following", "the next sample's problem", "purple", 2.2),
+        ("plant", "from where the plant is", "orange", 1.2),
+        ("model", "from where the model says", "blue", 1.2),
     )
     for name, label, colour, width in lines:
         low.plot(t[:-1], getattr(found, name), color=COLOURS[colour], lw=width, label=label)
@@ -76,7 +76,8 @@ def value_figure(trace: Trace, title: str) -> Any:
     low.set_title("$V$ of what comes next $- (V_k - l_k)$; above zero the descent fails")
     low.set_ylabel("cost")
     low.set_xlabel("time, s")
-    low.legend()
+    low.set_ylim(top=10.0 ** (decade + 1.5))
+    low.legend(loc="upper right", ncols=3)
     return figure
 
 
@@ -98,7 +99,7 @@ def margin_figure(report: Report, trace: Trace, title: str) -> Any:
     top.set_title(
         f"{title}\nlargest eigenvalue of the terminal inequality (9.6), (9.28); above zero it fails"
     )
-    top.legend()
+    _legend(top)
     middle.plot(t, trace.inputs, color=COLOURS["blue"], label="rotor limits, N")
     if np.isfinite(trace.outputs).any():
         middle.plot(t, trace.outputs, color=COLOURS["purple"], label="state limits, SI")
@@ -106,14 +107,14 @@ def margin_figure(report: Report, trace: Trace, title: str) -> Any:
     middle.set_title(
         "distance of the terminal law to the limits (9.17), (9.18); below zero they are exceeded"
     )
-    middle.legend()
+    _legend(middle)
     low.semilogy(t, np.maximum(trace.end_level, 1e-12), color=COLOURS["blue"], label="end of the plan")
     if _INSCRIBED[0] in report.regions:
         level = report.regions[_INSCRIBED[0]].ellipsoid.level
         low.axhline(level, color=COLOURS["green"], ls="--", label="invariant ellipsoid of hover")
     low.set_title("$(x_N - r_N)'Q_f(x_N - r_N)$: below the line no limit is ever met again, at hover")
     low.set_xlabel("time, s")
-    low.legend()
+    _legend(low)
     return figure
 
 
@@ -131,14 +132,22 @@ def region_figure(report: Report, region: Region, title: str) -> Any:
     axis.set_xlabel("rotor 1 of the law, N")
     axis.set_ylabel("rotor 3 of the law, N")
     fraction = region.plant[-1].fraction
-    text = f"{title}: shadow of the invariant ellipsoid (blue), limits (red), flights of the plant (grey)"
-    if fraction < 1.0:
-        text += (
-            f"\nfrom the whole ellipsoid they leave it (orange); shrunk to {fraction:g} (dotted) all are safe"
-        )
-        text = text if region.plant[-1].safe else text.replace("all are safe", "some still exceed a limit")
+    text = f"{title}: shadow of the invariant ellipsoid (blue), limits (red)\nflights of the plant: "
+    if fraction == 1.0:
+        text += "grey, from the dots"
+    else:
+        end = "all keep the limits" if region.plant[-1].safe else "some still exceed a limit"
+        text += f"orange from all of it; grey from {fraction:g} of its radius (dotted): {end}"
     figure.suptitle(text, fontsize=8.5, x=0.01, ha="left")
     return figure
+
+
+def _legend(axis: Any) -> None:
+    """A legend in one line above the curves."""
+    low, high = axis.get_ylim()
+    logarithmic = axis.get_yscale() == "log"
+    axis.set_ylim(top=high * (high / low) ** 0.25 if logarithmic else high + 0.25 * (high - low))
+    axis.legend(loc="upper right", ncols=3)
 
 
 def _shadow(axis: Any, report: Report, region: Region, first: Array, second: Array) -> None:

@@ -86,6 +86,8 @@ def terminal_limits(trace: Trace) -> Certificate:
     inputs, outputs = trace.inputs >= -_ROW_TOLERANCE, trace.outputs >= -_ROW_TOLERANCE
     k = first_step(inputs & outputs)
     text = f"kept at {share(inputs & outputs):.1%} of {len(inputs)} samples"
+    if np.isposinf(trace.outputs).all():
+        text += " (the problem that is solved has no state limits)"
     if k is not None:
         kind = "rotor" if not inputs[k] else "state"
         slack = trace.inputs[k] if not inputs[k] else trace.outputs[k]
