@@ -17,7 +17,6 @@ from baselines import ResultsError, run_benchmark
 from baselines.__main__ import main
 from baselines.benchmark import REPORTED
 from baselines.report import Choice, build_report, read_run, render_report
-from baselines.report.build import _OTHER_BYTES
 from baselines.report.flights import BadFlightError, read_flight
 from baselines.report.page import embed, render_page
 from baselines.report.quantise import Blobs, decode, encode
@@ -59,6 +58,13 @@ def data_of(page):
     """The data that stand in a page."""
     found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)
     return json.loads(found[1])
+
+
+def bare_bytes(folder):
+    """Size of the page without its flights."""
+    report = build_report(read_run(folder))
+    environments = tuple(env._replace(flights=()) for env in report.environments)
+    return len(render_page(report._replace(environments=environments, blobs=())).encode())
 
 
 def a_flight(run):
@@ -105,7 +111,7 @@ def test_the_leaderboard_has_the_numbers_of_the_summary_with_their_intervals(fin
     for row in env.rows:
         for column in ("score", "effort", "violation_share", "score_minus_base"):
             expected = summary[row.policy][column], summary[row.policy][f"{column}_ci"]
-            assert row.cells[column] == expected
+            assert row.cells[column] == pytest.approx(expected, rel=1e-6, nan_ok=True)
     crashed = next(row for row in env.rows if row.policy == EVIL)
     assert crashed.cells["crashed"][0] == 3 and crashed.cells["cost"] == (None, None)
 
@@ -261,7 +267,7 @@ def test_ten_thousand_flights_make_a_page_below_3_mb(copied):
 
 def test_a_full_page_leaves_later_starts_out_and_says_so(finished, monkeypatch):
     room = sum(map(len, build_report(read_run(finished)).blobs)) + 10 * _PER_FLIGHT - 1
-    monkeypatch.setattr(baselines.report.build, "PAGE_BYTES", _OTHER_BYTES + room)
+    monkeypatch.setattr(baselines.report.build, "PAGE_BYTES", bare_bytes(finished) + room)
     report = build_report(read_run(finished))
     assert [len({f.seed for f in env.flights}) for env in report.environments] == [2, 1]
     assert report.notes[0].startswith("3 more saved flights are not in this page")
@@ -270,11 +276,22 @@ def test_a_full_page_leaves_later_starts_out_and_says_so(finished, monkeypatch):
 
 def test_a_page_too_small_for_one_start_of_each_environment_takes_fewer_samples(finished, monkeypatch):
     size = sum(map(len, build_report(read_run(finished)).blobs))
-    monkeypatch.setattr(baselines.report.build, "PAGE_BYTES", _OTHER_BYTES + size // 3)
+    monkeypatch.setattr(baselines.report.build, "PAGE_BYTES", bare_bytes(finished) + size // 3)
     report = build_report(read_run(finished))
     stride = round(report.environments[0].flights[0].dt / 0.05)
     assert stride in (2, 4) and f"one sample in {stride}" in report.notes[0]
     assert all(env.flights for env in report.environments)
+
+
+def test_contenders_stand_in_the_page_where_networks_were_trained(copied):
+    title, *_ = (env.title for env, _, _ in read_run(copied).environments())
+    columns = "env,condition,policy,kind,score,iqm,iqm_low,iqm_high,base,crashed,training_cpu_s"
+    row = f"{title},,ppo,model-free,0.5,0.6,0.55,0.65,lmpc,1,"
+    (copied / "contenders.csv").write_text(f"{columns}\n{row}\n")
+    first, second = build_report(read_run(copied)).environments
+    assert first.contenders.rows[0].policy == "ppo (model-free)" and second.contenders is None
+    assert first.contenders.rows[0].cells["iqm"] == (0.6, 0.55, 0.65)
+    assert [column.key for column in first.contenders.columns] == ["score", "iqm", "crashed"]
 
 
 def test_a_run_that_is_not_complete_makes_a_page_that_says_so(copied):

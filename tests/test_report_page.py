@@ -122,7 +122,7 @@ def clock(page):
 
 def test_the_first_environment_is_shown_with_two_policies_in_space_and_time(show):
     page = show()
-    assert page.locator("#environments button[aria-current=true]").inner_text() == CORRIDOR
+    assert page.locator("#environments button[aria-current=true]").inner_text() == "CorridorTracking"
     assert page.locator("#board tbody tr").count() == 3
     assert page.locator(".chips button[aria-pressed=true]").count() == 2
     titles = page.locator(".plot h3").all_inner_texts()
@@ -250,7 +250,7 @@ def test_the_leaderboard_sorts_by_click_and_by_keyboard(show):
 
 def test_policies_are_overlaid_or_stand_side_by_side_and_turn_together(show):
     page = show()
-    page.locator("#environments button", has_text=HELIX).click()
+    page.locator("#environments button", has_text="HelixTracking").click()
     until(page, "document.querySelectorAll('.chips button').length === 3")
     assert page.locator("#panes canvas").count() == 1
     page.get_by_role("button", name="Side by side").click()

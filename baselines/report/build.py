@@ -11,14 +11,13 @@ from baselines.errors import ResultsError
 from baselines.evaluation import NO_SPANNING_TREE
 from quad_envs.names import unknown_name
 
-from .folder import Finished, Run
-from .leaderboard import leaderboard
+from .folder import Finished, Run, read_contenders
+from .leaderboard import contender_board, leaderboard
 from .model import PAGE_FORMAT, Environment, Report
 from .page import render_page
 from .shelf import fill_shelf
 
 PAGE_BYTES = 2_900_000  # a page stays below 3 MB
-_OTHER_BYTES = 250_000  # of them for its own text and the leaderboards
 
 
 class Choice(NamedTuple):
@@ -51,22 +50,24 @@ def build_report(run: Run, choice: Choice | None = None) -> Report:
     wanted = None if choice is None else _resolve(run, choice)
     if wanted is not None:
         environments = [entry for entry in environments if entry[0].title == wanted["env"]]
-    seed = None if wanted is None else wanted["seed"]
-    shelf = fill_shelf([here for _, _, here in environments], PAGE_BYTES - _OTHER_BYTES, seed)
-    shown = []
-    for (env, results, here), found in zip(environments, shelf.flights, strict=True):
+    contenders = read_contenders(run.folder)
+    boards = []
+    for env, results, here in environments:
         columns, rows = leaderboard(results.summary(), results.base_of(env.title))
         trees = [one.evaluation.spanning_tree for one in here]
         note = NO_SPANNING_TREE if False in trees else ""
-        base = results.base_of(env.title)
-        facts = here[0].task
-        shown.append(
-            Environment(env.title, env.id, env.kwargs, facts, base, note, columns, rows, tuple(found))
+        base, compared = results.base_of(env.title), contender_board(contenders.get(env.title, ()))
+        boards.append(
+            Environment(env.title, env.id, env.kwargs, here[0].task, base, note, columns, rows, (), compared)
         )
-    notes = (*_notes_of_run(run), *shelf.notes)
-    return Report(
-        PAGE_FORMAT, run.suite.name, _provenance(run), notes, tuple(shown), shelf.blobs.texts(), wanted
+    notes, provenance = _notes_of_run(run), _provenance(run)
+    bare = Report(PAGE_FORMAT, run.suite.name, provenance, notes, tuple(boards), (), wanted)
+    room = PAGE_BYTES - len(render_page(bare).encode())
+    shelf = fill_shelf(
+        [here for _, _, here in environments], room, None if wanted is None else wanted["seed"]
     )
+    shown = (env._replace(flights=found) for env, found in zip(boards, shelf.flights, strict=True))
+    return bare._replace(notes=(*notes, *shelf.notes), environments=tuple(shown), blobs=shelf.blobs.texts())
 
 
 def _starts(here: Sequence[Finished]) -> list[int]:
@@ -96,11 +97,11 @@ def _resolve(run: Run, choice: Choice) -> dict[str, Any]:
     return {"env": env.title, "seed": seed, "policy": choice.policy or None}
 
 
-def _notes_of_run(run: Run) -> list[str]:
+def _notes_of_run(run: Run) -> tuple[str, ...]:
     done = len(run.finished)
     if done == run.units:
-        return []
-    return [f"This run is not complete: {done} of {run.units} units (environment x policy) are finished."]
+        return ()
+    return (f"This run is not complete: {done} of {run.units} units (environment x policy) are finished.",)
 
 
 def _provenance(run: Run) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import islice
@@ -105,6 +106,18 @@ def read_run(folder: Path) -> Run:
             "goes on where it stopped"
         )
     return Run(folder, config, suite, finished, len(units))
+
+
+def read_contenders(folder: Path) -> dict[str, list[dict[str, str]]]:
+    """Rows of contenders.csv by the title of the environment as flown; none where nothing was trained."""
+    path = folder / "contenders.csv"
+    out: dict[str, list[dict[str, str]]] = {}
+    if path.is_file():
+        with open(path, newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                title = f"{row['env']}, {row['condition']}" if row["condition"] else row["env"]
+                out.setdefault(title, []).append(row)
+    return out
 
 
 def _check_format(folder: Path, config: Any) -> None:

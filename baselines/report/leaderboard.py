@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from .model import Column, Row
+from .model import Board, Column, Row
 
 _FALLBACKS = ("relaxed", "previous_plan", "clipped_sdre", "hover")
 _UNITS = {"tilt": "rad", "velocity": "m/s", "position": "m", "rate": "N", "separation": "m"}
@@ -87,7 +87,7 @@ def leaderboard(
 
 def _row(summary: Mapping[str, Any], columns: Sequence[Column]) -> Row:
     found = {**summary, "fallbacks": sum(summary[name] for name in _FALLBACKS)}
-    cells = {
+    cells: dict[str, tuple[float | None, ...]] = {
         column.key: (_number(found.get(column.key)), _number(found.get(f"{column.key}_ci")))
         for column in columns
     }
@@ -95,4 +95,46 @@ def _row(summary: Mapping[str, Any], columns: Sequence[Column]) -> Row:
 
 
 def _number(value: Any) -> float | None:
-    return float(value) if value is not None and math.isfinite(value) else None
+    """To seven digits, which is more than the page shows; None where there is no number."""
+    return float(f"{value:.7g}") if value is not None and math.isfinite(value) else None
+
+
+# Column of contenders.csv, title, unit, what it is, better, kind; "[]" has its interval in two more columns.
+_CONTENDERS = (
+    ("score", "Score", "", "mean over training seeds and starts", 1, "number"),
+    ("iqm", "IQM", "", "interquartile mean of the score", 1, "interval"),
+    ("score_minus_base", "Δ score", "", "score minus that of {base}, same starts", 1, "interval"),
+    ("improvement", "P(better)", "", "probability to score more than {base} on a start", 1, "interval"),
+    ("seeds", "Seeds", "", "of the training", 0, "count"),
+    ("crashed", "Crashes", "", "flights that ended in a crash", -1, "count"),
+    ("violation_share", "Violating", "%", "share of steps in which a limit was exceeded", -1, "percent"),
+    ("decision_p50_ms", "Decision p50", "ms", "wall time of a decision, median", -1, "number"),
+    ("training_cpu_s", "Training", "CPU-s", "CPU time of one training, mean of the seeds", -1, "number"),
+    ("training_steps", "Training", "steps", "environment steps of one training", -1, "number"),
+)
+
+
+def contender_board(rows: Sequence[Mapping[str, str]]) -> Board | None:
+    """What `contenders.csv` says of one environment and condition; None if it says nothing.
+
+    Args:
+        rows: As text, of this environment and condition.
+    """
+    if not rows:
+        return None
+    base = rows[0]["base"]
+    columns = [Column(*entry)._replace(about=entry[3].format(base=base)) for entry in _CONTENDERS]
+    out = []
+    for row in rows:
+        cells: dict[str, tuple[float | None, ...]] = {}
+        for column in columns:
+            ends = ("_low", "_high") if column.kind == "interval" else ()
+            cells[column.key] = tuple(_text_number(row.get(column.key + end)) for end in ("", *ends))
+        out.append(Row(f"{row['policy']} ({row['kind']})", False, cells))
+    kept = tuple(c for c in columns if any(row.cells[c.key][0] is not None for row in out))
+    titles = [one.policy for row, one in zip(rows, out, strict=True) if row["policy"] == base]
+    return Board(titles[0] if titles else base, kept, tuple(out))
+
+
+def _text_number(text: str | None) -> float | None:
+    return _number(float(text)) if text else None

@@ -68,7 +68,7 @@ class Column(NamedTuple):
     unit: str
     about: str
     better: int  # 1: more is better, -1: less is better, 0: neither
-    kind: str = "number"  # or "score", "difference", "percent", "count"
+    kind: str = "number"  # or "score", "difference", "interval", "percent", "count"
 
 
 class Row(NamedTuple):
@@ -76,7 +76,15 @@ class Row(NamedTuple):
 
     policy: str
     privileged: bool
-    cells: dict[str, tuple[float | None, float | None]]  # column -> mean, half width
+    cells: dict[str, tuple[float | None, ...]]  # column -> mean, half width; or value, low, high
+
+
+class Board(NamedTuple):
+    """A table of contenders: controllers, and networks with all their training seeds."""
+
+    base: str
+    columns: tuple[Column, ...]
+    rows: tuple[Row, ...]
 
 
 class Environment(NamedTuple):
@@ -90,7 +98,8 @@ class Environment(NamedTuple):
     note: str
     columns: tuple[Column, ...]
     rows: tuple[Row, ...]
-    flights: tuple[Flight, ...]
+    flights: tuple[Flight, ...] = ()
+    contenders: Board | None = None  # where networks were trained
 
 
 class Report(NamedTuple):

@@ -67,18 +67,25 @@ function showHeading() {
   byId("notes").append(...report.notes.map((note) => element("li", {}, note)));
 }
 
+/** An id without what all ids have in common; labels stay as they are. */
+function shortTitle({ title }) {
+  return title.replace(/^quad\/(\w+)-v\d+/, "$1");
+}
+
 function showEnvironments() {
   const tabs = report.environments.map((environment) =>
-    element("button", { type: "button", onclick: () => choose(environment) }, environment.title),
+    element("button", { type: "button", onclick: () => choose(environment) }, shortTitle(environment)),
   );
   if (tabs.length > 1) byId("environments").append(...tabs);
   const choose = (environment, opened) => {
     tabs.forEach((tab, i) => tab.setAttribute("aria-current", String(report.environments[i] === environment)));
     byId("board").replaceChildren(drawBoard(environment));
+    byId("contenders").hidden = !environment.contenders;
+    if (environment.contenders) byId("contenders-board").replaceChildren(drawBoard(environment.contenders));
     const differences = environment.rows.length > 1 ? ` Δ: paired differences to ${environment.base} on the same starts; ▲ better, ▼ worse, where the interval excludes zero.` : "";
     const note = environment.note ? ` Note: ${environment.note}.` : "";
     byId("board-lede").textContent =
-      `${environment.title === environment.id ? "" : `${environment.id}. `}Means over flights with 95 % intervals; – where a crash leaves no honest mean.${differences}${note}`;
+      `${environment.id}. Means over flights with 95 % intervals; – where a crash leaves no honest mean.${differences}${note}`;
     showRun(environment);
     viewer.open(environment, opened);
   };

@@ -97,7 +97,7 @@ class Plot {
     context.lineWidth = 1;
     context.textBaseline = "middle";
     context.textAlign = "right";
-    const marks = this.spec.log ? decades(low, high) : ticks(low, high, 3);
+    const marks = this.spec.log ? decades(low, high) : ticks(low, high, 4);
     for (const mark of marks) {
       const y = this.y(mark);
       context.strokeStyle = line;

@@ -1,5 +1,6 @@
 // The leaderboard: sortable by click and by keyboard, with intervals and paired differences.
 
+/** board: an environment, or its contenders; what is drawn needs `base`, `columns` and `rows`. */
 function drawBoard(environment) {
   const state = { key: "score", down: true };
   const head = element("tr");
@@ -51,6 +52,7 @@ function boardRow(environment, row, scale) {
 function boardCell(column, row, environment, scale, own) {
   const [mean, half] = row.cells[column.key] ?? [null, null];
   if (column.kind === "difference") return differenceCell(column, mean, half, row.policy === environment.base);
+  if (column.kind === "interval") return intervalCell(column, row.cells[column.key], row.policy === environment.base);
   const cell = element("td", { own });
   const factor = column.kind === "percent" ? 100 : 1;
   const text = mean === null ? "–" : column.kind === "count" ? String(Math.round(mean)) : number(factor * mean);
@@ -73,6 +75,18 @@ function differenceCell(column, mean, half, isBase) {
   cell.append(`${word ? (good ? "▲ " : "▼ ") : ""}${text}`);
   if (half !== null) cell.append(element("span", { class: "half" }, `± ${halfWidth(half, text)}`));
   return cell;
+}
+
+/** A value with both ends of its interval; a difference is judged by whether they exclude zero. */
+function intervalCell(column, [value, low, high], isBase) {
+  if (value === null) return element("td", {}, "–");
+  const isDifference = column.key.endsWith("_minus_base");
+  if (isBase && isDifference) return element("td", { class: "half" }, "base");
+  const word = !isDifference || low * high <= 0 ? "" : value > 0 ? "better" : "worse";
+  const text = isDifference ? signed(value) : number(value, 3);
+  const mark = word ? (value > 0 ? "▲ " : "▼ ") : "";
+  const ends = low === null ? null : element("span", { class: "half" }, `[${number(low, 3)}, ${number(high, 3)}]`);
+  return element("td", { class: word }, mark + text, ends);
 }
 
 function scoreBar(mean, half, scale) {

@@ -134,7 +134,7 @@ const viewer = {
     focus.hidden = size < 2;
     const view = selectOf("View", this.views(size), this.follow, (value) => {
       this.follow = value;
-      this.camera.follow(value === "target" ? 0.5 : value ? 1.6 : null);
+      this.camera.follow(value === "target" ? 0.3 : value ? 1.6 : null);
       this.drawScenes();
     });
     const active = document.activeElement?.closest("#choices") && document.activeElement.dataset.name;
