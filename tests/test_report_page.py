@@ -320,6 +320,35 @@ def test_a_replay_opens_on_its_flight(show, folder, tmp_path):
     assert page.get_by_label("Start").first.input_value() == "1"
 
 
+def test_contenders_have_a_table_of_their_own(show, folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "run")
+    columns = (
+        "env,condition,policy,kind,base,score,score_minus_base,score_minus_base_low,score_minus_base_high"
+    )
+    rows = [f"{HELIX},,lqr,controller,lqr,0.5,0,0,0", f"{HELIX},,ppo,model-free,lqr,0.7,0.2,0.15,0.25"]
+    (copy / "contenders.csv").write_text("\n".join([columns, *rows, ""]))
+    path = tmp_path / "page.html"
+    path.write_text(render_report(read_run(copy)), "utf-8")
+    page = show(path)
+    assert not page.locator("#contenders").is_visible()
+    page.locator("#environments button", has_text="HelixTracking").click()
+    text = page.locator("#contenders-board tbody").inner_text()
+    assert (
+        "NaN" not in text
+        and text.startswith("ppo (model-free)")
+        and "▲ +0.200[0.150, 0.250]" in text
+        and "base" in text
+    )
+
+
+def test_after_a_crash_there_are_no_values(show):
+    page = show()
+    page.locator(".chips button", has_text="feedback-linearization").click()
+    until(page, "document.querySelectorAll('.chips button[aria-pressed=true]').length === 3")
+    page.locator("#scrub").fill("10")
+    assert "\u2013" in page.locator(".plot .readout").first.inner_text()
+
+
 def test_a_flight_that_ended_in_its_first_step_is_shown(show, folder, tmp_path):
     copy = tmp_path / "run"
     shutil.copytree(folder, copy)

@@ -190,8 +190,8 @@ class Plot {
 }
 
 function valueAt({ values, dt, end }, time) {
-  const row = Math.min(Math.floor(time / dt + 1e-6), values.length - 1);
-  return row > end ? NaN : values[row];
+  const row = Math.floor(time / dt + 1e-6);
+  return row > end ? NaN : values[Math.min(row, values.length - 1)];
 }
 
 function decades(low, high) {

@@ -32,7 +32,8 @@ function groupsOf({ shown, focus }, name, linesOf) {
     if (!tables) continue;
     const vehicles = tables.map((_, i) => i).filter((i) => focus === null || i === focus || tables.length === 1);
     const alone = shown.length === 1 && vehicles.length > 1;
-    const parts = alone ? vehicles.map((vehicle) => [vehicle]) : [vehicles];
+    const apart = alone && vehicles.length <= VEHICLE_COLOURS; // more would be more than one can tell apart
+    const parts = apart ? vehicles.map((vehicle) => [vehicle]) : [vehicles];
     for (const part of parts) {
       const series = part.flatMap((vehicle) =>
         linesOf(tables[vehicle], flight, vehicle).map((line) => ({
@@ -42,7 +43,7 @@ function groupsOf({ shown, focus }, name, linesOf) {
           name: [part.length > 1 || alone ? `vehicle ${vehicle + 1}` : "", line.name ?? ""].filter(Boolean).join(" "),
         })),
       );
-      out.push({ label: alone ? `${part[0] + 1}` : label, colour: colourOf(part[0]), series });
+      out.push({ label: apart ? `${part[0] + 1}` : label, colour: colourOf(part[0]), series });
     }
   }
   return out;

@@ -50,7 +50,7 @@ function boardRow(environment, row, scale) {
 }
 
 function boardCell(column, row, environment, scale, own) {
-  const [mean, half] = row.cells[column.key] ?? [null, null];
+  const [mean = null, half = null] = row.cells[column.key] ?? [];
   if (column.kind === "difference") return differenceCell(column, mean, half, row.policy === environment.base);
   if (column.kind === "interval") return intervalCell(column, row.cells[column.key], row.policy === environment.base);
   const cell = element("td", { own });
