@@ -1,4 +1,4 @@
-"""The dissertation's tables and claims, each beside what this implementation gives."""
+"""The dissertation's tables, claims and figures, each beside what this implementation gives."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from pathlib import Path
 
 from quad_envs.names import unknown_name
 
+from ..figures import house_style
 from ..results import write_atomic
-from . import estimation_claims, estimation_tables, formation_claims, formation_tables, target_claims
+from . import estimation_claims, estimation_tables, formation_claims, formation_tables, page, target_claims
 from .regulation_claims import REGULATION_CLAIMS
 from .results import Section
 from .tables import table_4_1, table_4_2
@@ -56,43 +57,99 @@ SECTIONS: dict[str, Callable[[int], Section]] = {
 }
 
 
-def sections(what: Sequence[str] = (), jobs: int = 1) -> Iterator[Section]:
+FIGURE_SECTIONS = ("figures-4", "figures-5", "figures-6", "figures-7", "beyond")
+# In the order of the page: after each chapter's numbers its figures.
+ORDER = (
+    "table-4.1", "table-4.2", "claims-4", "figures-4", "claims-5", "figures-5", "claims-6", "figures-6",
+    "claims-7", "figures-7", "beyond",
+)  # fmt: skip
+
+
+def section_names(what: Sequence[str] = (), figures: bool = False) -> list[str]:
+    """Names of the sections that are asked for, each once.
+
+    Args:
+        what: Names in ORDER; none, or "all", for all of them.
+        figures: Whether there is a folder for figures; without one, "all" leaves them out.
+
+    Raises:
+        ValueError: If a name is unknown, or figures are asked for by name without a folder.
+    """
+    for name in what:
+        if name != "all" and name not in ORDER:
+            raise ValueError(unknown_name("table, claims or figures", name, [*ORDER, "all"]))
+        if name in FIGURE_SECTIONS and not figures:
+            raise ValueError(f"{name} is drawn into a folder: add --out DIR")
+    if not what or "all" in what:
+        return [name for name in ORDER if figures or name not in FIGURE_SECTIONS]
+    return list(dict.fromkeys(what))
+
+
+def sections(what: Sequence[str] = (), jobs: int = 1, out: Path | None = None) -> Iterator[Section]:
     """The sections that are asked for, each as soon as it is flown.
 
     Args:
-        what: Names in SECTIONS; none, or "all", for all of them.
+        what: Names in ORDER; none, or "all", for all of them.
         jobs: Flights in parallel, >= 1. Decision times are measured one flight at a time whatever it is.
+        out: Folder of the figures; without one, there are none.
 
     Raises:
-        ValueError: If a name is unknown or jobs < 1; at once, before the first section.
+        ValueError: If a name is unknown, figures have no folder, or jobs < 1; at once, before the first.
+        MissingPackageError: If figures are asked for and matplotlib is not installed; at once, too.
     """
-    for name in what:
-        if name != "all" and name not in SECTIONS:
-            raise ValueError(unknown_name("table or claims", name, [*SECTIONS, "all"]))
+    names = section_names(what, out is not None)
     if isinstance(jobs, bool) or not isinstance(jobs, int) or jobs < 1:
         raise ValueError(f"jobs must be a whole number >= 1, got {jobs!r}")
-    names = list(SECTIONS) if not what or "all" in what else list(dict.fromkeys(what))
-    return (SECTIONS[name](jobs) for name in names)
+    if any(name in FIGURE_SECTIONS for name in names):
+        with house_style():
+            pass
+    return (_section(name, jobs, out) for name in names)
 
 
-def reproduce(what: Sequence[str] = (), jobs: int = 1) -> list[Section]:
-    """Reproduce tables and claims; see `sections`."""
-    return list(sections(what, jobs))
+def _section(name: str, jobs: int, out: Path | None) -> Section:
+    if name in SECTIONS or out is None:
+        return SECTIONS[name](jobs)
+    from .figures import draw_section
+
+    return draw_section(name, out, jobs)
+
+
+def reproduce(what: Sequence[str] = (), jobs: int = 1, out: Path | None = None) -> list[Section]:
+    """Reproduce tables, claims and, where there is a folder for them, figures; see `sections`."""
+    return list(sections(what, jobs, out))
 
 
 def run(what: list[str], out: Path | None, as_json: bool, jobs: int) -> int:
-    """The command: print the sections, and write them to `out`/reproduce.json where given."""
-    asked = sections(what, jobs)
+    """The command: print the sections, and write them to `out` where given.
+
+    After each section `out`/reproduce.json and the page `out`/reproduction.html are written anew: what is
+    finished is there whenever the run ends.
+    """
+    asked, names = sections(what, jobs, out), section_names(what, out is not None)
+    found: list[Section] = []
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-    found = []
+        _write(
+            found, names, out
+        )  # now, so that a folder that cannot be written ends the run before its flights
     for section in asked:
         found.append(section)
         if not as_json:
             print(section, end="\n\n", flush=True)
-    text = json.dumps({"sections": [section.to_dict() for section in found]}, indent=2) + "\n"
+        if out is not None:
+            _write(found, names, out)
     if as_json:
-        sys.stdout.write(text)
-    if out is not None:
-        write_atomic(out / "reproduce.json", text.encode())
+        sys.stdout.write(_as_json(found))
+    elif out is not None:
+        print(f"{out / page.NAME} has it all on one page")
+    elif not what or "all" in what:
+        print("Figures and the page are made with --out DIR.")
     return 0
+
+
+def _as_json(found: list[Section]) -> str:
+    return json.dumps({"sections": [section.to_dict() for section in found]}, indent=2) + "\n"
+
+
+def _write(found: list[Section], names: list[str], out: Path) -> None:
+    write_atomic(out / "reproduce.json", _as_json(found).encode())
+    write_atomic(out / page.NAME, page.render(found, out, names[len(found) :]).encode())

@@ -83,9 +83,15 @@ def bounds(vehicle: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 @cache
+def aircraft_scene() -> Scene:
+    """Range and angles on the aircraft."""
+    return record(FUSION_RUNS, target=_AIRCRAFT, **_KNOWN)
+
+
+@cache
 def aircraft(model: str) -> Track:
-    """Range and angles on the aircraft: "decaying" (as printed), "constant" or "Cartesian"."""
-    scene = record(FUSION_RUNS, target=_AIRCRAFT, **_KNOWN)
+    """Filters on the aircraft: "decaying" (as printed), "constant" or "Cartesian"."""
+    scene = aircraft_scene()
     if model == "Cartesian":
         mean = scene.target[0, 0]
         start = drawn(scene, mean, np.repeat([0.5, 0.3], 3))

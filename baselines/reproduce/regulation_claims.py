@@ -17,17 +17,20 @@ WEAK_ROTORS = 0.3125  # kappa of 2.45 N
 _SIDES = {"below": 1.0, "above": -1.0}
 
 
-def _flight(name: str, d: float, side: str, kappa: float, gains: dict[str, float] | None = None) -> Flight:
+def regulation_flight(
+    name: str, d: float, side: str, kappa: float, gains: dict[str, float] | None = None
+) -> Flight:
+    """From (d, d, d) below the origin, or its mirror image above it; kappa is that of the rotors."""
     options: dict[str, Any] = {"policy": gains} if gains else {}
     return Flight(name, ORIGIN, (d, d, _SIDES[side] * d), env={"kappa": kappa}, **options)
 
 
-def _settled(outcome: Outcome) -> bool:
-    """Within 5 % of the initial error at the end."""
+def settled(outcome: Outcome) -> bool:
+    """Whether it is within 5 % of the initial error at the end."""
     return not outcome.record.crashed and bool(outcome.error[-1] < 0.05 * outcome.error[0])
 
 
-def _overshoot(outcome: Outcome) -> float:
+def overshoot(outcome: Outcome) -> float:
     """How far the vehicle goes beyond the origin, along the line from its start, relative to the distance."""
     start = outcome.states[0, :3]
     along = outcome.states[:, :3] @ start / (start @ start)
@@ -35,24 +38,24 @@ def _overshoot(outcome: Outcome) -> float:
 
 
 def _describe(outcome: Outcome) -> str:
-    if not _settled(outcome):
+    if not settled(outcome):
         return "not settled"
-    return f"{outcome.record.settling_time:.2f} s, overshoot {_overshoot(outcome):.0%}"
+    return f"{outcome.record.settling_time:.2f} s, overshoot {overshoot(outcome):.0%}"
 
 
 def comparable_claim(jobs: int = 1) -> Claim:
     """Section 4.8: from (1,1,1) and (2,2,2) comparable to LMPC, slightly faster, mild overshoot."""
     cases = [(side, d) for side in _SIDES for d in (1.0, 2.0)]
     gains = {"above": GAINS_FROM_ABOVE, "below": GAINS_FROM_BELOW}
-    flights = [_flight("FBL", d, side, 1.0, gains[side]) for side, d in cases]
-    flights += [_flight("LMPC", d, side, 1.0) for side, d in cases]
+    flights = [regulation_flight("FBL", d, side, 1.0, gains[side]) for side, d in cases]
+    flights += [regulation_flight("LMPC", d, side, 1.0) for side, d in cases]
     flown = fly_all(flights, jobs)
     ours, linear = flown[: len(cases)], flown[len(cases) :]
     numbers: dict[str, float | str] = {}
     agrees = []
     for (side, d), fbl, lmpc in zip(cases, ours, linear, strict=True):
         numbers[f"from {side}, d = {d:g} (FBL; LMPC)"] = f"{_describe(fbl)}; {_describe(lmpc)}"
-        agrees.append(_settled(fbl) and fbl.record.settling_time <= lmpc.record.settling_time + 0.25)
+        agrees.append(settled(fbl) and fbl.record.settling_time <= lmpc.record.settling_time + 0.25)
     text = "feedback linearization is comparable to LMPC from (1,1,1) and (2,2,2), slightly faster"
     return Claim("4-fbl-comparable", text, verdict(float(np.mean(agrees))), numbers)
 
@@ -64,8 +67,8 @@ def saturation_claim(jobs: int = 1) -> Claim:
         ("below", "gains from below", GAINS_FROM_BELOW),
         ("below", "default gains", None),
     ]
-    flights = [_flight("FBL", 2.0, side, WEAK_ROTORS, gains) for side, _, gains in cases]
-    flights += [_flight("LMPC", 2.0, side, WEAK_ROTORS) for side, _, _ in cases]
+    flights = [regulation_flight("FBL", 2.0, side, WEAK_ROTORS, gains) for side, _, gains in cases]
+    flights += [regulation_flight("LMPC", 2.0, side, WEAK_ROTORS) for side, _, _ in cases]
     share = [outcome.record.saturation_share for outcome in fly_all(flights, jobs)]
     n = len(cases)
     numbers: dict[str, float | str] = {
@@ -93,8 +96,8 @@ def random_gains(rng: np.random.Generator, n: int) -> list[dict[str, float]]:
 def _stable_counts(gains: Sequence[dict[str, float]], side: str, jobs: int) -> tuple[int, int, int]:
     """Sets that are stable from d = 1 and 2; those of them that fail from 3; all that are stable from 3."""
     distances = (1.0, 2.0, 3.0)
-    flights = [_flight("FBL", d, side, WEAK_ROTORS, g) for g in gains for d in distances]
-    stable = np.array([_settled(outcome) for outcome in fly_all(flights, jobs)]).reshape(-1, 3)
+    flights = [regulation_flight("FBL", d, side, WEAK_ROTORS, g) for g in gains for d in distances]
+    stable = np.array([settled(outcome) for outcome in fly_all(flights, jobs)]).reshape(-1, 3)
     near = stable[:, 0] & stable[:, 1]
     return int(near.sum()), int((near & ~stable[:, 2]).sum()), int(stable[:, 2].sum())
 
@@ -110,14 +113,14 @@ def instability_claim(jobs: int = 1, samples: int = 475) -> Claim:
             f"{near / samples:.0%}; {whole / samples:.0%}; {far / samples:.0%} of {samples} random gain sets"
         )
         shares.append(whole / samples)
-    linear = fly_all([_flight("LMPC", d, s, WEAK_ROTORS) for s in _SIDES for d in (3.0, 5.0)], jobs)
-    default = fly_all([_flight("FBL", 3.0, s, WEAK_ROTORS) for s in _SIDES], jobs)
-    found = fly_all([_flight("FBL", 3.0, "above", WEAK_ROTORS, GAINS_FROM_ABOVE)], jobs)[0]
-    numbers["LMPC from 3 and 5 m"] = "stable" if all(map(_settled, linear)) else "not always stable"
-    numbers["default gains from 3 m"] = "stable" if all(map(_settled, default)) else "not always stable"
+    linear = fly_all([regulation_flight("LMPC", d, s, WEAK_ROTORS) for s in _SIDES for d in (3.0, 5.0)], jobs)
+    default = fly_all([regulation_flight("FBL", 3.0, s, WEAK_ROTORS) for s in _SIDES], jobs)
+    found = fly_all([regulation_flight("FBL", 3.0, "above", WEAK_ROTORS, GAINS_FROM_ABOVE)], jobs)[0]
+    numbers["LMPC from 3 and 5 m"] = "stable" if all(map(settled, linear)) else "not always stable"
+    numbers["default gains from 3 m"] = "stable" if all(map(settled, default)) else "not always stable"
     numbers["gains from above, from (3,3,-3)"] = (
         "stable"
-        if _settled(found)
+        if settled(found)
         else f"lost after {found.record.steps * 0.05:.1f} s"
         if found.record.crashed
         else "not settled"

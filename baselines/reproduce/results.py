@@ -47,13 +47,27 @@ class Claim(NamedTuple):
     prototype: str = ""  # verdict that an independent prototype led to, where there is one
 
 
+class Plate(NamedTuple):
+    """A figure that was drawn and saved."""
+
+    key: str  # "4.1"
+    title: str
+    printed: str  # what the source says of it
+    caption: str
+    verdict: str  # as of a claim; SHOWN where the source states nothing
+    numbers: Mapping[str, float | str]
+    claims: tuple[str, ...]  # keys of the claims that treat the same
+    files: tuple[str, ...]  # PNG and PDF, relative to the results folder
+
+
 class Section(NamedTuple):
-    """One thing that can be asked for: a table or the claims of a chapter."""
+    """One thing that can be asked for: a table, the claims or the figures of a chapter."""
 
     name: str
     title: str
     cells: list[Cell] | list[Measured]
     claims: list[Claim]
+    plates: tuple[Plate, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -62,6 +76,7 @@ class Section(NamedTuple):
             "title": self.title,
             "cells": [_cell_to_dict(cell) for cell in self.cells],
             "claims": [_claim_to_dict(claim) for claim in self.claims],
+            "figures": [{**plate._asdict(), "numbers": _finite_all(plate.numbers)} for plate in self.plates],
         }
 
     def __str__(self) -> str:
@@ -78,9 +93,10 @@ class Section(NamedTuple):
             mean_square = sum(m * m for m in misfit) / len(misfit)
             parts.append(f"relative misfit: rms {mean_square**0.5:.1%}, largest {max(misfit):.1%}")
         if measured:
-            rows = [[cell.where, cell.quantity, _show(cell.prototype), _show(cell.ours)] for cell in measured]
+            rows = [[cell.where, cell.quantity, show(cell.prototype), show(cell.ours)] for cell in measured]
             parts.append(format_table(["", "quantity", "prototype", "ours"], rows))
         parts += map(_claim_text, self.claims)
+        parts += map(_plate_text, self.plates)
         return "\n\n".join(parts)
 
 
@@ -91,10 +107,14 @@ def _cell_to_dict(cell: Cell | Measured) -> dict[str, Any]:
 
 
 def _claim_to_dict(claim: Claim) -> dict[str, Any]:
-    said = {**claim._asdict(), "numbers": {name: _finite(value) for name, value in claim.numbers.items()}}
+    said = {**claim._asdict(), "numbers": _finite_all(claim.numbers)}
     if not claim.prototype:
         del said["prototype"]
     return said
+
+
+def _finite_all(numbers: Mapping[str, float | str]) -> dict[str, float | str | None]:
+    return {name: _finite(value) for name, value in numbers.items()}
 
 
 def _finite(value: float | str) -> float | str | None:
@@ -102,13 +122,19 @@ def _finite(value: float | str) -> float | str | None:
 
 
 def _claim_text(claim: Claim) -> str:
-    numbers = "; ".join(f"{name}: {_show(value)}" for name, value in claim.numbers.items())
+    numbers = "; ".join(f"{name}: {show(value)}" for name, value in claim.numbers.items())
     differs = claim.prototype and claim.prototype != claim.verdict
     aside = f", prototype: {claim.prototype}" if differs else ""
     return f"[{claim.verdict}{aside}] {claim.text}\n    {numbers}"
 
 
-def _show(value: float | str) -> str:
+def _plate_text(plate: Plate) -> str:
+    numbers = "; ".join(f"{name}: {show(value)}" for name, value in plate.numbers.items())
+    return f"[{plate.verdict}] {plate.key} {plate.title}: {plate.files[0]}\n    {numbers}"
+
+
+def show(value: float | str) -> str:
+    """A number of a claim as text."""
     return value if isinstance(value, str) else format_number(value, 3)
 
 

@@ -15,7 +15,7 @@ from quad_envs.parameters import POSITION, Array
 from ..environments import make_env
 from ..estimate_wrapper import EstimateWrapper, Fusion
 from ..policy import make_policy
-from ..rollout import run_episodes
+from ..rollout import Episode, run_episodes
 
 FORMATION, TRACKING = "quad/Formation-v0", "quad/TargetTracking-v0"
 _SETTLED = 0.1  # m
@@ -93,8 +93,8 @@ class TeamOutcome(NamedTuple):
         return np.full_like(found, np.inf) if self.crashed else np.asarray(found)
 
 
-def fly_team(flight: TeamFlight) -> TeamOutcome:
-    """Fly one episode."""
+def team_episodes(flight: TeamFlight) -> list[Episode]:
+    """Fly one episode of a team: that of each vehicle."""
     settings = {"crash_distance": _NO_CRASH, **flight.env}
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*no spanning tree.*")  # some claims are about that
@@ -102,7 +102,16 @@ def fly_team(flight: TeamFlight) -> TeamOutcome:
     if flight.fusion is not None:
         env = EstimateWrapper(env, fusion=flight.fusion)
     policy = make_policy(flight.name, env, **flight.policy)
-    episodes = list(run_episodes(policy, env, 1, flight.seed))
+    return list(run_episodes(policy, env, 1, flight.seed))
+
+
+def fly_team(flight: TeamFlight) -> TeamOutcome:
+    """Fly one episode, and keep what the claims look at."""
+    return outcome_of(team_episodes(flight))
+
+
+def outcome_of(episodes: list[Episode]) -> TeamOutcome:
+    """What is kept of the episodes of a team."""
     states = np.stack([episode.states for episode in episodes], axis=1)
     slots = np.stack([episode.references[0, POSITION] for episode in episodes])
     p, steps = states[..., POSITION], len(states)

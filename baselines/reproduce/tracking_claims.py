@@ -91,7 +91,7 @@ def regulation_claim(jobs: int = 1, samples: int = 60) -> Claim:
     return Claim("4-regulation", text, verdict(mean), numbers)
 
 
-def _below_from(error: Array, threshold: float) -> float:
+def below_from(error: Array, threshold: float) -> float:
     """Time from which the error stays below a threshold, s."""
     above = np.flatnonzero(error >= threshold)
     return _DT * float(above[-1] + 1) if above.size else 0.0
@@ -103,7 +103,7 @@ def transient_claim(jobs: int = 1) -> Claim:
     flights = [Flight(name, reference) for reference in DESCENDING.values() for name in names]
     error = [outcome.error for outcome in fly_all(flights, jobs)]
     helix, spiral, lines = error[0:2], error[2:4], error[4:6]
-    first = [[_below_from(e, limit) for e in pair] for pair, limit in ((helix, 0.5), (spiral, 0.25))]
+    first = [[below_from(e, limit) for e in pair] for pair, limit in ((helix, 0.5), (spiral, 0.25))]
     after = [float(e[100:].mean()) for e in lines]
     numbers: dict[str, float | str] = {
         "helix, s until error < 0.5 m (LMPC, NMPC)": f"{first[0][0]:.2f}, {first[0][1]:.2f}",
