@@ -1,6 +1,7 @@
 # make demo   install into .venv, fly every tracking baseline on the helix and write a page of it (needs Python and pip)
 # make test   install the development extras and run ruff, mypy and the tests
 # make slow   the tests that take longer: dissertation tables, other solvers, long flights
+# make docs   build the documentation into site/
 # make rllib  install RLlib into .venv-rllib (it pins an older gymnasium) and train a formation on a local Ray
 # make test-rllib  conformance with that gymnasium, and the example, in that environment
 # make ray    fly the quick benchmark on joblib's Ray backend, in the same environment
@@ -11,7 +12,7 @@ BIN := $(VENV)/bin
 RLLIB_PIP := $(RLLIB)/bin/python -m pip --disable-pip-version-check -q install -c examples/constraints-rllib.txt
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 
-.PHONY: demo test slow rllib test-rllib ray clean
+.PHONY: demo test slow docs rllib test-rllib ray clean
 
 demo: $(VENV)/installed
 	$(BIN)/quad-envs benchmark quick --fresh --out runs/demo
@@ -25,6 +26,10 @@ test: $(VENV)/installed-dev
 
 slow: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m slow
+
+docs: $(VENV)/installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
+	@echo "Open this page in a browser: $(CURDIR)/site/index.html"
 
 rllib: $(RLLIB)/installed
 	$(RLLIB)/bin/python -m examples.rllib_formation
@@ -51,5 +56,9 @@ $(VENV)/installed-dev: $(VENV)/installed
 	$(PIP) install -c constraints.txt -e ".[dev]"
 	touch $@
 
+$(VENV)/installed-docs: $(VENV)/installed
+	$(PIP) install -c constraints.txt -e ".[docs]"
+	touch $@
+
 clean:
-	rm -rf $(VENV) $(RLLIB) build *.egg-info
+	rm -rf $(VENV) $(RLLIB) site build *.egg-info

@@ -1,0 +1,55 @@
+"""What MkDocs does to each page beyond its plugins, so that the site loads nothing from elsewhere.
+
+Equations become MathML when the site is built: `pymdownx.arithmatex` has marked them, their TeX escaped as
+HTML. And the one script that the theme would take from the network is the copy in docs/vendor.
+"""
+
+from __future__ import annotations
+
+import html
+import re
+from typing import Any
+
+_INLINE = re.compile(r'<span class="arithmatex">\\\((.*?)\\\)</span>', re.DOTALL)
+_DISPLAY = re.compile(r'<div class="arithmatex">\\\[(.*?)\\\]</div>', re.DOTALL)
+_SHIM, _OWN_SHIM = "https://unpkg.com/iframe-worker/shim", "vendor/iframe-worker.js"
+
+
+def to_mathml(tex: str, display: str) -> str:
+    """MathML of an equation.
+
+    Args:
+        tex: The equation in TeX, escaped as HTML.
+        display: "inline" or "block".
+
+    Raises:
+        ValueError: If a command is left that the converter does not know; it would print it as it stands.
+    """
+    from latex2mathml.converter import convert
+
+    source = html.unescape(tex).strip()
+    found: str = convert(source, display=display)
+    unknown = re.findall(r">\s*(\\[A-Za-z]+|&(?=<))", found)
+    if unknown:
+        raise ValueError(f"no MathML for {', '.join(unknown)} in the equation {source!r}")
+    # Browsers know MathML Core, which leaves the alignment of columns to CSS, and takes a bar for a relation.
+    found = re.sub(r'columnalign="(\w+)"', r'style="text-align: \1"', found)
+    return re.sub(r"<mo( stretchy=\"false\")?>(&#x0007C;)", r'<mo\1 lspace="0" rspace="0">\2', found)
+
+
+def on_page_content(content: str, **kwargs: Any) -> str:
+    """The page with its equations in MathML."""
+    content = _INLINE.sub(lambda match: to_mathml(match[1], "inline"), content)
+    return _DISPLAY.sub(lambda match: f'<div class="equation">{to_mathml(match[1], "block")}</div>', content)
+
+
+def on_post_page(output: str, page: Any, **kwargs: Any) -> str:
+    """The page with our copy of the theme's script."""
+    from mkdocs.utils import get_relative_url
+
+    return output.replace(_SHIM, get_relative_url(_OWN_SHIM, page.url))
+
+
+def on_post_template(output: str, **kwargs: Any) -> str:
+    """The same for pages that are not Markdown, as 404.html."""
+    return output.replace(_SHIM, _OWN_SHIM)

@@ -1,0 +1,141 @@
+"""Every code block of the documentation and of the README does what its page says.
+
+Blocks of a page run in order, in one module and in an empty folder: Python as it stands, `quad-envs ...` as
+the command line would, and a block with a title is a file of that name. After `<!-- not run: why -->` a block
+is only read: Python is compiled, commands are parsed. Of the README the commands are only parsed, too.
+"""
+
+import importlib.util
+import pathlib
+import re
+import shlex
+import subprocess
+import sys
+import types
+from typing import NamedTuple
+
+import pytest
+
+from baselines.__main__ import main, make_parser
+
+ROOT = pathlib.Path(__file__).parent.parent
+README = ROOT / "README.md"
+PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
+QUICK = ("docs/extending.md", "docs/maths/qp.md", "docs/maths/sdc.md")  # run by default, the others are slow
+LANGUAGES = ("python", "bash", "toml", "csv", "text", "")  # "": text
+_FENCE = re.compile(r"^```(\w*)(?: title=\"([^\"]+)\")?\s*$")
+_MARK = re.compile(r"<!-- not run: .+ -->")
+
+
+class Block(NamedTuple):
+    language: str
+    title: str
+    code: str
+    line: int  # of the fence
+    runs: bool
+
+
+def name_of(page):
+    return page.relative_to(ROOT).as_posix()
+
+
+def blocks_of(page):
+    lines = page.read_text(encoding="utf-8").splitlines()
+    blocks, start, head = [], None, None
+    for number, line in enumerate(lines):
+        if start is None and line.startswith("```"):
+            head = _FENCE.match(line)
+            assert head, (
+                f"{name_of(page)}, line {number + 1}: a fence is ```language or ```language title=..."
+            )
+            start = number
+        elif start is not None and line.startswith("```"):
+            runs = not (_MARK.fullmatch(lines[start - 1]) or (page == README and head[1] == "bash"))
+            code = "\n".join(lines[start + 1 : number]) + "\n"
+            blocks.append(Block(head[1], head[2] or "", code, start + 1, runs))
+            start = None
+    assert start is None, f"{name_of(page)}, line {start + 1}: the block has no end"
+    return blocks
+
+
+def commands_of(block):
+    joined = block.code.replace("\\\n", " ")
+    return [words for line in joined.splitlines() if (words := shlex.split(line, comments=True))]
+
+
+def has_something_to_run(page):
+    return any(block.runs and block.language in ("python", "bash") for block in blocks_of(page))
+
+
+def pages(condition):
+    return [
+        pytest.param(page, id=name_of(page), marks=[] if name_of(page) in QUICK else pytest.mark.slow)
+        for page in PAGES
+        if condition(page)
+    ]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_block_can_be_read(page):
+    for block in blocks_of(page):
+        where = f"{name_of(page)}, line {block.line}"
+        assert block.language in LANGUAGES, where
+        if block.language == "python":
+            compile(block.code, where, "exec")
+        if block.language == "bash":
+            for words in commands_of(block):
+                read_command(words, where)
+
+
+def read_command(words, where):
+    """Refuse a command that does not exist, or options that it does not have."""
+    if words[0] == "quad-envs":
+        found, rest = make_parser().parse_known_args(words[1:])
+        assert not rest, f"{where}: {found.command} has no option {rest[0]}"
+    elif words[0] == "make":
+        targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+        assert set(words[1:]) <= set(targets), where
+    elif words[:2] == ["python", "-m"]:
+        assert importlib.util.find_spec(words[2]), where
+    else:
+        assert words[0] in ("pip", "tensorboard", "git", "cd"), f"{where}: nothing tests {words[0]!r}"
+
+
+@pytest.mark.parametrize("page", pages(has_something_to_run))
+def test_every_block_runs(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    module = types.ModuleType("documented_page")  # a real one, so that its classes pickle
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    for block in blocks_of(page):
+        if not block.runs:
+            continue
+        if block.title:
+            pathlib.Path(block.title).write_text(block.code, encoding="utf-8")
+        elif block.language == "python":
+            source = "\n" * block.line + block.code  # so that a traceback names the line of the page
+            exec(compile(source, str(page), "exec"), module.__dict__)
+        elif block.language == "bash":
+            for words in commands_of(block):
+                assert words[0] == "quad-envs", (
+                    f"{name_of(page)}, line {block.line}: mark {words[0]} as not run"
+                )
+                assert main(words[1:]) == 0, shlex.join(words)
+
+
+def test_every_page_is_in_the_navigation_and_every_entry_of_it_is_a_page():
+    listed = re.findall(r": (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(listed) == sorted(page.relative_to(ROOT / "docs").as_posix() for page in PAGES[1:])
+
+
+@pytest.mark.slow
+def test_the_site_builds_strictly_and_loads_nothing_from_elsewhere(tmp_path):
+    pytest.importorskip("mkdocs", reason="the site needs the extra [docs]")
+    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(tmp_path)]
+    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr
+    for page in tmp_path.rglob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        loaded = re.findall(r"<(?:script|img|iframe|source)[^>]*\ssrc=[\"']?(https?:[^\"'\s>]+)", text)
+        loaded += re.findall(r"<link[^>]*rel=[\"']?stylesheet[^>]*href=[\"']?(https?:[^\"'\s>]+)", text)
+        assert not loaded, page
+        assert 'class="arithmatex"' not in text, f"{page}: an equation was left as TeX"
