@@ -1,0 +1,44 @@
+"""The trained networks that come with the suite."""
+
+import json
+
+import pytest
+
+from baselines import make_policy, shipped_policies
+from baselines.trained import SHIPPED, shipped_name
+from baselines.training.shipping import judged
+from quad_envs.registration import TRACKING
+
+NAMES = sorted(shipped_policies())
+
+
+def test_every_tracking_task_has_a_policy_of_each_class():
+    for env_id in TRACKING:
+        for algorithm in ("apg", "dagger", "ppo"):
+            assert shipped_name(algorithm, env_id) in NAMES
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_shipped_policy_is_small_and_says_what_made_it(name):
+    assert sum(path.stat().st_size for path in (SHIPPED / name).iterdir()) < 200_000
+    said = json.loads((SHIPPED / name / "policy.json").read_text())
+    assert said["made_by"].startswith(f"quad-envs train {said['env_id']} {said['algorithm']} --seed ")
+    assert {"python", "numpy", "torch"} <= set(said["versions"]) and said["git_revision"]
+    assert "/" not in json.dumps({**said, "env_id": "", "made_by": ""})  # no path of the machine that made it
+    assert (SHIPPED / name / "curve.csv").read_text().startswith("cpu_seconds,steps,updates,score")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_a_shipped_policy_has_its_recorded_score(name):
+    said = json.loads((SHIPPED / name / "policy.json").read_text())
+    found = judged(SHIPPED / name)
+    # Rounding differs between processors, and a flight of 200 steps may carry it on.
+    assert found.score == pytest.approx(said["score"], abs=1e-4)
+    assert found.violation_share == pytest.approx(said["violation_share"], abs=1e-3)
+    assert found.crashes == said["crashes"]
+
+
+def test_a_shipped_policy_flies_by_its_name_without_torch(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "torch", None)  # an import of it would fail
+    assert make_policy("apg-helix", "quad/HelixTracking-v0").kind == "model-based"
