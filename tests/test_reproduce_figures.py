@@ -2,14 +2,18 @@
 
 import base64
 import hashlib
+import io
 import json
 import re
 import sys
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from baselines import reproduce as package
 from baselines.errors import MissingPackageError, ResultsError
+from baselines.figures import COLOURS
 from baselines.reproduce import FIGURE_SECTIONS, ORDER, SECTIONS, figures, page, run, section_names, sections
 from baselines.reproduce.figures import FIGURES, draw_plate
 from baselines.reproduce.figures.model import OWN, REDRAWN, SHOWN
@@ -79,9 +83,16 @@ def test_a_folder_that_cannot_be_written_ends_the_run_before_its_flights(tmp_pat
         run(["table-4.1"], tmp_path / "file" / "out", False, 1)
 
 
-def test_a_figure_is_written_as_png_and_pdf(tmp_path):
-    plate = draw_plate(SKETCHES["4.13"], tmp_path)
-    png, pdf = (tmp_path / name for name in plate.files)
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    """The folder with one figure that needs no flight, and what is known of it."""
+    folder = tmp_path_factory.mktemp("figures")
+    return folder, draw_plate(SKETCHES["4.13"], folder)
+
+
+def test_a_figure_is_written_as_png_and_pdf(drawn):
+    folder, plate = drawn
+    png, pdf = (folder / name for name in plate.files)
     assert png.read_bytes().startswith(b"\x89PNG") and pdf.read_bytes().startswith(b"%PDF")
     assert plate.verdict == SHOWN and plate.files[0] == "figures/figure-4-13.png"
 
@@ -94,27 +105,27 @@ def test_a_figure_of_each_chapter_is_drawn_and_judged(key, tmp_path):
     assert (tmp_path / plate.files[0]).stat().st_size > 10_000
 
 
-def a_section(tmp_path, text="a claim", word="FALSE"):
-    plate = draw_plate(SKETCHES["4.13"], tmp_path)._replace(title=text, caption=text, numbers={text: text})
+def a_section(drawn, text="a claim", word="FALSE"):
+    plate = drawn[1]._replace(title=text, caption=text, numbers={text: text})
     claim = Claim("k", text, word, {text: 1.0, "lost": float("inf")})
     return Section("claims-4", text, [Cell(text, text, 2.0, 1.0)], [claim], (plate,))
 
 
-def test_a_page_escapes_what_it_shows(tmp_path):
-    section = a_section(tmp_path, EVIL)
+def test_a_page_escapes_what_it_shows(drawn):
+    section = a_section(drawn, EVIL)
     measured = Section("claims-5", EVIL, [Measured(EVIL, EVIL, 1.0, 2.0)], [])
-    text = page.render([section, measured], tmp_path, [EVIL])
+    text = page.render([section, measured], drawn[0], [EVIL])
     assert "<script" not in text and text.count("&lt;script&gt;") >= 10
 
 
 @pytest.mark.parametrize("word", page.VERDICTS)
-def test_a_page_says_each_verdict_in_words(word, tmp_path):
-    text = page.render([a_section(tmp_path, word=word)], tmp_path)
+def test_a_page_says_each_verdict_in_words(word, drawn):
+    text = page.render([a_section(drawn, word=word)], drawn[0])
     assert f'<h3>a claim</h3><span class="verdict {word.lower()}">{word}</span>' in text
 
 
-def test_a_page_loads_nothing_and_its_policy_allows_its_own_style_alone(tmp_path):
-    text = page.render([a_section(tmp_path)], tmp_path)
+def test_a_page_loads_nothing_and_its_policy_allows_its_own_style_alone(drawn):
+    text = page.render([a_section(drawn)], drawn[0])
     style = re.search(r"<style>(.*)</style>", text, re.DOTALL)[1]
     digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
     assert f"default-src 'none'; style-src 'sha256-{digest}'; img-src data:;" in text
@@ -123,15 +134,25 @@ def test_a_page_loads_nothing_and_its_policy_allows_its_own_style_alone(tmp_path
     )
 
 
-def test_a_page_lists_its_contents_and_what_is_missing(tmp_path):
-    text = page.render([a_section(tmp_path)], tmp_path, ["claims-5"])
+def test_the_images_of_a_page_keep_the_colours_that_tell_curves_apart(drawn):
+    folder, plate = drawn  # blue, orange and green, each of them a thin line
+    data, width, height = page._small(folder / plate.files[0], 0)
+    image = np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"), dtype=float)
+    assert image.shape == (height, width, 3) and (image[0] == 255.0).all()
+    for name in ("blue", "orange", "green"):
+        near = np.abs(image - 255.0 * np.array(COLOURS[name])).max(axis=-1) < 10.0  # smoothing of a thin line
+        assert near.sum() > 200
+
+
+def test_a_page_lists_its_contents_and_what_is_missing(drawn):
+    text = page.render([a_section(drawn)], drawn[0], ["claims-5"])
     assert '<a href="#claims-4">' in text and 'id="claims-4"' in text
     assert "Not finished yet, or interrupted: claims-5." in text
     assert "<code>quad-envs reproduce claims-4 --out DIR</code>" in text
 
 
-def test_a_printed_number_that_is_far_off_is_said_to_be(tmp_path):
-    text = page.render([a_section(tmp_path)], tmp_path)
+def test_a_printed_number_that_is_far_off_is_said_to_be(drawn):
+    text = page.render([a_section(drawn)], drawn[0])
     assert "beyond 15%" in text and "0 of 1 numbers within 5%" in text
 
 

@@ -16,6 +16,9 @@ from html import escape
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
+
+from ..figures import COLOURS
 from .results import Cell, Claim, Measured, Plate, Section, show, verdict
 
 NAME = "reproduction.html"
@@ -25,7 +28,9 @@ VERDICTS = {
     "FALSE": "we get something else",
     "SHOWN": "a picture of which the text states nothing",
 }
-_WIDTH, _COLOURS = 960, 48  # of the images in the page, pixels
+_WIDTH = 960  # of the images in the page, pixels
+_SHADES = 24  # of each house colour, from itself to white
+_PAPER = 243  # of 255, from which a shade counts as white
 _NEAR, _FAR = 0.05, 0.15  # relative misfit of a printed number
 
 
@@ -67,7 +72,7 @@ def render(sections: Sequence[Section], folder: Path, missing: Sequence[str] = (
 def _head(sections: Sequence[Section], missing: Sequence[str]) -> str:
     total = Counter(word for section in sections for word in _words(section))
     meaning = "".join(
-        f"<dt>{_badge(word)} {total[word]} times</dt><dd>{escape(text)}</dd>"
+        f"<dt>{_badge(word, f'{total[word]} {word}')}</dt><dd>{escape(text)}</dd>"
         for word, text in VERDICTS.items()
     )
     note = (
@@ -80,7 +85,7 @@ def _head(sections: Sequence[Section], missing: Sequence[str]) -> str:
 and Estimation</cite> (2017) beside what our flights give, each with a verdict computed from the numbers under
 it, and the command that repeats it. Figures are redrawn from our own flights: the source has their data
 as pictures only.</p>
-<dl>{meaning}</dl>{note}"""
+<dl class="meaning">{meaning}</dl>{note}"""
 
 
 def _words(section: Section) -> Iterable[str]:
@@ -207,12 +212,28 @@ def _image(path: Path, label: str) -> str:
 
 @lru_cache(maxsize=256)
 def _small(path: Path, _changed: int) -> tuple[str, int, int]:
-    """A figure as the page shows it, base64: smaller, and with few colours."""
+    """A figure as the page shows it, base64: smaller, and in shades of the house colours alone.
+
+    A palette found in the image itself would merge the colours of thin lines, which have few pixels.
+    """
     from PIL import Image
 
     with Image.open(path) as full:
         size = (_WIDTH, round(full.height * _WIDTH / full.width))
         image = full.convert("RGB").resize(size, Image.Resampling.LANCZOS)
     data = io.BytesIO()
-    image.quantize(_COLOURS, dither=Image.Dither.NONE).save(data, "PNG", optimize=True)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(_palette())
+    image.quantize(palette=palette, dither=Image.Dither.NONE).save(data, "PNG", optimize=True)
     return base64.b64encode(data.getvalue()).decode("ascii"), *size
+
+
+def _palette() -> list[int]:
+    """Red, green and blue of at most 256 colours: those of the house, each fading into white.
+
+    Shades that are nearly white are left out: Pillow matches colours roughly, and paper has to stay white.
+    """
+    share = np.linspace(1.0, 0.0, _SHADES, endpoint=False)[:, None]
+    fading = [255.0 - share * (255.0 - 255.0 * np.array(colour)) for colour in COLOURS.values()]
+    shades = np.rint(np.concatenate(fading)).astype(int)
+    return [255, 255, 255, *shades[shades.min(axis=1) < _PAPER].ravel().tolist()]

@@ -141,7 +141,8 @@ def velocity_figure(task: str, jobs: int = 1) -> Drawing:
     figure, axes = new_figure(1, 1, height=1.0)
     for i, (name, colour) in enumerate(zip("xyz", ("blue", "orange", "green"), strict=True)):
         label = f"$v_{name}$" + " (down)" * (name == "z")
-        axes[0, 0].plot(t, rows[:, 3 + i], color=COLOURS[colour], drawstyle="steps-post", label=label)
+        axes[0, 0].step(t, rows[:, 3 + i], "--" if name == "y" else "-", color=COLOURS[colour], where="post",
+                        label=label)  # fmt: skip
     axes[0, 0].set_ylabel("velocity, m/s")
     axes[0, 0].set_xlabel("time, s")
     axes[0, 0].margins(y=0.12)
@@ -152,9 +153,9 @@ def velocity_figure(task: str, jobs: int = 1) -> Drawing:
 
 
 def _pair(number: int, task: str, disturbed: bool) -> list[Sketch]:
-    what = f"{TASKS[task]} trajectory" + ", torque disturbance from 5 s on" * disturbed
+    what = f"{TASKS[task]} trajectory" + ", disturbed" * disturbed
     how = "LMPC and SDC-NMPC (N = 25, alpha = 1/2, Q = R = I)"
-    aside = ", both told of the torque and feeding it forward" if disturbed else ""
+    aside = ", torque disturbance from 5 s on, which both are told of and feed forward" if disturbed else ""
     acts = "perform well under the disturbance" if disturbed else "achieve good tracking"
     better = "The transient response of the nonlinear MPC is clearly better"
     kept = "; errors stay acceptable and the inputs within their bounds" if disturbed else ""
