@@ -9,6 +9,7 @@ from stub_training import stubs  # noqa: F401
 
 from baselines import ResultsError, Suite, load_suite, run_benchmark
 from baselines.contenders import ALL
+from baselines.environments import make_env
 from baselines.suite_files import suite_from_dict
 from baselines.training.finished import train_unit
 from baselines.units import suite_units, training_units
@@ -90,6 +91,13 @@ def test_another_network_in_the_folder_is_not_taken(tmp_path):
     other = {**LEARNED, "envs": [{**LEARNED["envs"][0], "kwargs": {"time_limit": 2.0}}], "conditions": []}
     with pytest.raises(ResultsError, match="holds another training: its env_kwargs"):
         run_benchmark(other, tmp_path / "b", networks=tmp_path / "nets")
+
+
+def test_every_condition_of_the_shipped_suite_can_be_flown():
+    suite = load_suite("rl-vs-mpc")
+    for env in suite.envs:
+        for flown in suite.flown(env).values():
+            make_env(flown.id, **flown.kwargs).close()
 
 
 def test_a_quick_suite_is_a_small_part():
