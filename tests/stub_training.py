@@ -30,7 +30,7 @@ class Progress(NamedTuple):
 
 def stub(task_options, options, seed, spent, start=None):
     """Each update draws another network around hover; after `fails_at` of them something happens."""
-    task, rng, update = task_options.make_task(), np.random.default_rng(seed), 0
+    task, rng, update = task_options.task, np.random.default_rng(seed), 0
     features = networks.default_features(task.layout)
     while spent() < 1.0:
         update += 1

@@ -104,7 +104,7 @@ def test_a_distance_without_a_team_or_below_its_own_is_refused(env_id, separatio
 
 def test_networks_do_not_see_slots_that_nobody_fills():
     options = training_options(FORMATION, {"formation": "hexagon"})  # each hears one other
-    flights = LabelledFlights(options, make_policy("hover", options.make_task()), 12, 0, (0, 2))
+    flights = LabelledFlights(options, make_policy("hover", options.task), 12, 0, (0, 2))
     names = flights.features.names
     assert {name.split("]")[0] for name in names if name.startswith("comm")} == {"comm[0"}
     assert {name.split("]")[0] for name in names if name.startswith("preview")} == {"preview[0", "preview[2"}

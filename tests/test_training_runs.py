@@ -227,7 +227,7 @@ def test_hyperparameters_come_from_the_committed_files():
 
 def test_a_task_is_the_one_of_its_id():
     for env_id in (*TRACKING, *TEAMS):
-        assert training_options(env_id, {}).make_task().env_id == env_id
+        assert training_options(env_id, {}).task.env_id == env_id
 
 
 def test_the_command_prints_the_best_and_a_line_per_evaluation(tmp_path, capsys):

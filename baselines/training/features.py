@@ -23,7 +23,7 @@ def training_features(
     Raises:
         ValueError: If the preview has not these stages.
     """
-    layout = options.make_task().layout
+    layout = options.task.layout
     if stages is not None and not set(stages) <= set(range(layout.preview + 1)):
         raise ValueError(
             f"hyperparameter stages: the preview has stages 0 to {layout.preview}, got {stages!r}"

@@ -195,7 +195,7 @@ def train(
         TrainingError: If the loss is not finite.
     """
     torch.manual_seed(seed)
-    expert = make_expert(options.expert, task_options.make_task(), options.separation)
+    expert = make_expert(options.expert, task_options.task, options.separation)
     if options.episode_steps is not None:
         if not isinstance(task_options, TeamOptions):
             raise ValueError(

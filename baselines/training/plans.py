@@ -73,7 +73,7 @@ def make_plan(
         )
     kwargs = dict(env_kwargs or {})
     task_options = training_options(env_id, kwargs)
-    mission = mission_of(task_options.make_task())
+    mission = mission_of(task_options.task)
     entry = algorithm_for(algorithm, mission)
     budget = Budget(entry.seconds if seconds is None and steps is None else seconds, steps)
     require_packages(algorithm)

@@ -36,10 +36,6 @@ class TrackingOptions(VehicleOptions):
         self.start_state()
         make_reference(self.reference)
 
-    def make_task(self) -> Task:
-        """The value from which policies are built."""
-        return self.task
-
     def _make_task(self) -> Task:
         """The task that follows from the options."""
         known = self.task_fields()

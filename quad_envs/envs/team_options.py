@@ -156,10 +156,6 @@ class TeamOptions(VehicleOptions):
         """Vehicles that know where to go without hearing anybody."""
         return [0]
 
-    def make_task(self) -> TeamTask:
-        """The value from which policies are built."""
-        return self.task
-
     def _make_task(self) -> TeamTask:
         """The task that follows from the options.
 
