@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -167,44 +167,56 @@ def run_benchmark(
     suite = load_suite(suite)
     check_engine(engine)
     require_whole("jobs", jobs, 1)
-    if save_episodes and out is None:
-        raise ValueError("save_episodes needs a folder: give out")
-    if training_units(suite) and out is None and networks is None:
-        raise ValueError(f"suite {suite.name!r} trains networks, which need a folder: give out or networks")
-    folder = None if out is None else Path(out).absolute()
+    _refuse_no_folder(suite, out, networks, save_episodes)
     _refuse_bad_units(suite)
-    hold: AbstractContextManager[None] = nullcontext() if folder is None else locked(folder)
-    with hold:
+    folder = None if out is None else Path(out).absolute()
+    with nullcontext() if folder is None else locked(folder):
+        sweep = _Sweep(suite, folder, networks, save_episodes, fresh)
+        sweep.go(engine, jobs, on_unit or (lambda finished, total: None))
+        return sweep.finish()
+
+
+class _Sweep:
+    """One run of a suite: the units to train and to fly, those that are done, and the folder of both."""
+
+    def __init__(
+        self, suite: Suite, folder: Path | None, networks: str | Path | None, all_flights: bool, fresh: bool
+    ) -> None:
+        self.suite, self.folder = suite, folder
         home = Path(networks or (folder or Path()) / "networks").absolute()
-        to_train = training_units(suite, home)
         episodes = None if folder is None else folder / "episodes"
-        units = suite_units(suite, episodes, suite.episodes if save_episodes else REPORTED, home)
+        self.to_train = training_units(suite, home)
+        self.units = suite_units(suite, episodes, suite.episodes if all_flights else REPORTED, home)
         if folder is not None and fresh:
             discard(folder)
-        done = _begin(folder, suite, units, save_episodes)
-        report = on_unit or (lambda finished, total: None)
-        total = len(to_train) + len(units)
-        trained: dict[int, dict[str, Any]] = {}
-        report(len(done), total)
-        for index, training in run_units(train_unit, to_train, engine, jobs):
-            trained[index] = training
-            report(len(trained) + len(done), total)
-        for index, cell in run_units(
-            fly_unit, [unit for unit in units if unit.number not in done], engine, jobs
-        ):
-            if folder is not None:
-                write_json(folder / "cells" / units[index].file_name, cell)
-            done[index] = cell
-            report(len(trained) + len(done), total)
+        self.flown = _begin(folder, suite, self.units, all_flights)  # cells by the number of their unit
+        self.trained: dict[int, dict[str, Any]] = {}
+
+    def go(self, engine: str, jobs: int, report: Callable[[int, int], None]) -> None:
+        """Train, then fly what is left; each flown unit is stored at once."""
+        total = len(self.to_train) + len(self.units)
+        left = [unit for unit in self.units if unit.number not in self.flown]
+        report(len(self.flown), total)
+        for number, training in run_units(train_unit, self.to_train, engine, jobs):
+            self.trained[number] = training
+            report(len(self.trained) + len(self.flown), total)
+        for number, cell in run_units(fly_unit, left, engine, jobs):
+            if self.folder is not None:
+                write_json(self.folder / "cells" / self.units[number].file_name, cell)
+            self.flown[number] = cell
+            report(len(self.trained) + len(self.flown), total)
+
+    def finish(self) -> Results:
+        """What was found; the tables and the report of it are written."""
         results = Results(
-            suite,
-            tuple(Evaluation.from_plain(done[unit.number]["found"]) for unit in units),
-            tuple(trained[unit.number] for unit in to_train),
+            self.suite,
+            tuple(Evaluation.from_plain(self.flown[unit.number]["found"]) for unit in self.units),
+            tuple(self.trained[unit.number] for unit in self.to_train),
         )
-        if folder is not None:
-            _write_tables(folder, results)
-            write_atomic(folder / "report.html", render_report(read_run(folder)).encode())
-    return results
+        if self.folder is not None:
+            _write_tables(self.folder, results)
+            write_atomic(self.folder / "report.html", render_report(read_run(self.folder)).encode())
+        return results
 
 
 def _write_tables(folder: Path, results: Results) -> None:
@@ -213,6 +225,16 @@ def _write_tables(folder: Path, results: Results) -> None:
     write_csv(folder / "results.csv", results.rows())
     if results.suite.learned:
         write_csv(folder / "contenders.csv", results.contender_rows())
+
+
+def _refuse_no_folder(
+    suite: Suite, out: str | Path | None, networks: str | Path | None, save_episodes: bool
+) -> None:
+    """Some of what is asked for needs a place."""
+    if save_episodes and out is None:
+        raise ValueError("save_episodes needs a folder: give out")
+    if training_units(suite) and out is None and networks is None:
+        raise ValueError(f"suite {suite.name!r} trains networks, which need a folder: give out or networks")
 
 
 def _refuse_bad_units(suite: Suite) -> None:
