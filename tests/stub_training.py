@@ -59,7 +59,7 @@ def once_only(task_options, options, seed, spent):
 @pytest.fixture(autouse=True)
 def stubs(monkeypatch):
     entry = Algorithm(
-        __name__, "stub", "StubOptions", "imitation", ("tracking", "formation"), "a stub", 2.0, ()
+        __name__, "stub", StubOptions, "imitation", ("tracking", "formation"), "a stub", 2.0, ()
     )
     monkeypatch.setitem(ALGORITHMS, "stub", entry)
     monkeypatch.setitem(ALGORITHMS, "once", entry._replace(generator="once_only"))

@@ -60,12 +60,22 @@ def test_every_public_name_exists():
         _ = quad_envs.Nonsense
 
 
-def test_importing_loads_nothing_heavy():
-    code = (
-        "import sys, quad_envs\n"
-        "heavy = {'torch', 'scipy.optimize', 'osqp', 'matplotlib', 'PIL', 'stable_baselines3', 'pandas'}\n"
-        "print(sorted(heavy & set(sys.modules)))"
-    )
+@pytest.mark.parametrize(
+    ("modules", "heavy"),
+    [
+        (
+            "quad_envs",
+            {"torch", "scipy.optimize", "osqp", "matplotlib", "PIL", "stable_baselines3", "pandas"},
+        ),
+        ("baselines", {"torch", "scipy", "osqp", "matplotlib", "PIL", "stable_baselines3", "numba"}),
+        (
+            "baselines.training.runs, baselines.training.imitation, baselines.training.policy_gradient",
+            {"torch", "stable_baselines3", "matplotlib", "tensorboard"},
+        ),
+    ],
+)
+def test_importing_loads_nothing_heavy(modules, heavy):
+    code = f"import sys, {modules}; print(sorted({heavy!r} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

@@ -1,4 +1,9 @@
-"""Learned policies: training, checkpoints, and inference without torch. Names load at first use."""
+"""Learned policies: training, checkpoints, and inference without torch. Names load at first use.
+
+Torch is needed by `policy_gradient` and `imitation`, once they train, and by `tanh`, `learner`, `lagrangian`,
+`vec_env` and `sb3`, which derive from its classes or those of stable-baselines3 and load them when they are
+imported. Only the generators of `algorithms` import those; runs, plans, hyperparameters and networks do not.
+"""
 
 from __future__ import annotations
 

@@ -19,6 +19,13 @@ from typing import Any, NamedTuple
 from quad_envs.names import unknown_name
 
 from ..errors import MissingPackageError
+from .algorithm_options import (
+    DaggerOptions,
+    PolicyGradientOptions,
+    PpoLagrangianOptions,
+    PpoOptions,
+    SacOptions,
+)
 
 TRACKING, FORMATION, TARGET, ESTIMATION = "tracking", "formation", "target-tracking", "estimation"
 
@@ -28,7 +35,7 @@ class Algorithm(NamedTuple):
 
     module: str
     generator: str  # name in the module
-    options: str  # name of the dataclass of its hyperparameters
+    options: type[Any]  # the dataclass of its hyperparameters
     kind: str  # what it knows: "model-free", "imitation" or "model-based"
     missions: tuple[str, ...]  # on which tasks it can act
     description: str
@@ -41,7 +48,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     "apg": Algorithm(
         ".policy_gradient",
         "train",
-        "PolicyGradientOptions",
+        PolicyGradientOptions,
         "model-based",
         (TRACKING,),
         "analytic policy gradient through the compiled dynamics",
@@ -49,7 +56,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     "dagger": Algorithm(
         ".imitation",
         "train",
-        "DaggerOptions",
+        DaggerOptions,
         "imitation",
         (TRACKING, FORMATION),
         "imitation of an MPC, labelled where the network flies",
@@ -58,7 +65,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     "ppo": Algorithm(
         ".sb3",
         "train_ppo",
-        "PpoOptions",
+        PpoOptions,
         "model-free",
         (TRACKING, FORMATION, TARGET),
         "proximal policy optimisation on the shared reward",
@@ -68,7 +75,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     "ppo-lagrangian": Algorithm(
         ".sb3",
         "train_ppo_lagrangian",
-        "PpoLagrangianOptions",
+        PpoLagrangianOptions,
         "model-free",
         (TRACKING, FORMATION, TARGET),
         "the same, with a multiplier that holds the share of violating steps under a limit",
@@ -78,7 +85,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     "sac": Algorithm(
         ".sb3",
         "train_sac",
-        "SacOptions",
+        SacOptions,
         "model-free",
         (TRACKING,),
         "soft actor-critic on the shared reward",
@@ -130,9 +137,7 @@ def generator_of(name: str) -> Callable[..., Any]:
 
 def options_of(name: str) -> type[Any]:
     """The dataclass of an algorithm's hyperparameters."""
-    entry = ALGORITHMS[name]
-    found: type[Any] = getattr(import_module(entry.module, __package__), entry.options)
-    return found
+    return ALGORITHMS[name].options
 
 
 def resumable(name: str) -> bool:

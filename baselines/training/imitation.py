@@ -8,10 +8,10 @@ observation shows cannot be imitated by a network that remembers nothing.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from quad_envs.envs.options import TrackingOptions
 from quad_envs.envs.team_options import TeamOptions
@@ -22,33 +22,17 @@ from quad_envs.tasks import BaseTask, TeamTask
 from ..errors import TrainingError
 from ..policy import Policy, make_policy, mission_of
 from ..rollout import is_privileged
+from .algorithm_options import DaggerOptions
 from .features import training_features
-from .networks import Floats, Network, NetworkPolicy, Squash, hover_outputs
-from .policy_gradient import Actor, Progress
+from .held_out import Progress
+from .networks import Floats, Network, NetworkPolicy, hover_outputs
+from .policy_gradient import Actor
+
+if TYPE_CHECKING:
+    import torch
 
 _EXPERTS = {"tracking": "sdc-nmpc", "formation": "consensus-mpc"}
 _STREAM = 0xDA_66E2  # apart from the seeds of environments, so that no start is one of those held out
-
-
-@dataclass(frozen=True, slots=True)
-class DaggerOptions:
-    """Hyperparameters of DAgger."""
-
-    expert: str = ""  # a policy, or a trained one; sdc-nmpc for one vehicle, consensus-mpc for formations
-    rows: int = 64  # flights, or vehicles of all teams
-    window: int = 20  # steps of each row between fits
-    expert_flies: float = 0.2  # share of the budget in which the rows that the expert flies fall to none
-    fits: int = 40  # minibatches after each window at the beginning
-    final_fits: int = 200  # and at the end of the budget, when there are many labels
-    batch: int = 512
-    learning_rate: float = 3e-3
-    final_rate: float = 0.02  # share of the learning rate at the end of the budget
-    threshold: float = 0.05  # of an output's error, up to which the loss is quadratic
-    hidden: tuple[int, ...] = (64, 64)
-    squash: Squash = "tanh"  # how outputs come into [-1, 1]; "clip" as PPO, which can then go on from here
-    stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for the usual ones
-    separation: float | None = None  # m, that the expert of a team keeps; None for the task's own
-    episode_steps: int | None = None  # of a team's flight in training; None for the task's own
 
 
 class LabelledFlights:
@@ -138,6 +122,8 @@ class Labels:
 
     def draw(self, n: int, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
         """Rows at random, n of them."""
+        import torch
+
         rows = rng.integers(0, self.count, n)
         return torch.from_numpy(self._x[rows]), torch.from_numpy(self._y[rows])
 
@@ -194,6 +180,8 @@ def train(
         ValueError: If the expert is not allowed.
         TrainingError: If the loss is not finite.
     """
+    import torch
+
     torch.manual_seed(seed)
     expert = make_expert(options.expert, task_options.task, options.separation)
     if options.episode_steps is not None:
@@ -234,6 +222,8 @@ def _fit(
     rng: np.random.Generator,
 ) -> float:
     """Some minibatches; the last loss."""
+    import torch
+
     loss = torch.zeros(())
     for _ in range(fits):
         x, y = labels.draw(options.batch, rng)

@@ -9,45 +9,18 @@ vanishes where a flight is far off and where a violation exceeds its scale. Eval
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import torch
 
 from quad_envs.envs.options import TrackingOptions
 
 from ..errors import TrainingError
+from .algorithm_options import PolicyGradientOptions
 from .flights import DifferentiableFlights
+from .held_out import Progress
 from .networks import Floats, Network, Squash, hover_actions, hover_slopes
-from .tanh import fast_tanh
-
-
-@dataclass(frozen=True, slots=True)
-class PolicyGradientOptions:
-    """Hyperparameters of the analytic policy gradient."""
-
-    flights: int = 64
-    horizon: int = 25  # steps of a window at the beginning
-    final_horizon: int = 25  # and at the end; long windows see more of what follows, but learn late
-    substeps: int = 2  # of the integrator while training; 5 in evaluation
-    learning_rate: float = 1e-2
-    final_rate: float = 0.03  # share of the learning rate at the end of the budget
-    discount: float = 0.99
-    epsilon: float = 1e-3  # of log(r + epsilon), at the beginning
-    final_epsilon: float = 1e-3  # and at the end; the larger, the more it is the sum of rewards itself
-    penalty: float = 0.0  # weight of the violation cost in the objective
-    hidden: tuple[int, ...] = (64, 64)
-    gradient_norm: float = 1.0  # to which gradients are clipped
-
-
-class Progress(NamedTuple):
-    """After an update."""
-
-    update: int
-    steps: int  # environment steps so far
-    reward: float  # mean of the window
 
 
 class Actor:
@@ -61,6 +34,8 @@ class Actor:
     """
 
     def __init__(self, inputs: int, hidden: tuple[int, ...], outputs: int, squash: Squash = "tanh") -> None:
+        import torch
+
         self.squash = squash
         sizes = (inputs, *hidden, outputs)
         self.layers = [torch.nn.Linear(a, b) for a, b in pairwise(sizes)]
@@ -71,6 +46,8 @@ class Actor:
 
     def __call__(self, x: Any) -> Any:
         """Outputs for scaled features (n, inputs), (n, outputs)."""
+        from .tanh import fast_tanh
+
         for layer in self.layers[:-1]:
             x = fast_tanh(layer(x))
         x = self.layers[-1](x)
@@ -82,6 +59,8 @@ class Actor:
         Raises:
             ValueError: If it has other layers.
         """
+        import torch
+
         shapes = [tuple(layer.weight.shape[::-1]) for layer in self.layers]
         if [W.shape for W in network.weights] != shapes or network.squash != self.squash:
             raise ValueError(
@@ -105,6 +84,8 @@ def _window_gradient(
     actor: Actor, flights: DifferentiableFlights, options: PolicyGradientOptions, horizon: int, epsilon: float
 ) -> float:
     """Roll a window out, take it back, leave the gradient in the actor's parameters; the mean reward."""
+    import torch
+
     seen, outputs, records = [], [], []
     for _ in range(horizon):
         x = torch.from_numpy(flights.observe()).requires_grad_()
@@ -149,6 +130,8 @@ def train(
         ValueError: If the task cannot be differentiated.
         TrainingError: If the gradient is not finite.
     """
+    import torch
+
     torch.manual_seed(seed)
     flights = DifferentiableFlights(task_options, options.flights, seed)
     actor = Actor(len(flights.features.names), options.hidden, 4)

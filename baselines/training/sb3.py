@@ -20,12 +20,12 @@ from stable_baselines3.common.vec_env import VecEnv
 from quad_envs.envs.team_options import TeamOptions
 
 from ..errors import TrainingError
+from .algorithm_options import PpoLagrangianOptions, PpoOptions, SacOptions
 from .features import training_features
+from .held_out import Progress
 from .lagrangian import LagrangianBuffer, LagrangianEnv, Multiplier, Probe
 from .learner import RowBuffer, Tanh
 from .networks import Features, Network
-from .policy_gradient import Progress
-from .sb3_options import PpoLagrangianOptions, PpoOptions, SacOptions
 from .vec_env import TaskOptions, TrainingVecEnv
 
 _PROBES = 500_000_009  # from the seed of training to that of the flights which measure violations

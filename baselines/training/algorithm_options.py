@@ -1,15 +1,58 @@
-"""Hyperparameters of what trains with stable-baselines3."""
+"""Hyperparameters of each algorithm, as values: reading them loads no torch."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .networks import Squash
 
 _POSITIVE = (
     *("rows", "horizon", "batch", "epochs", "learning_rate", "final_rate", "discount", "clip"),
     *("gradient_norm", "gradient_steps", "memory", "smoothing", "probes"),
 )
 _SHARES = ("free", "final_rate", "discount", "trace", "smoothing")
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyGradientOptions:
+    """Hyperparameters of the analytic policy gradient."""
+
+    flights: int = 64
+    horizon: int = 25  # steps of a window at the beginning
+    final_horizon: int = 25  # and at the end; long windows see more of what follows, but learn late
+    substeps: int = 2  # of the integrator while training; 5 in evaluation
+    learning_rate: float = 1e-2
+    final_rate: float = 0.03  # share of the learning rate at the end of the budget
+    discount: float = 0.99
+    epsilon: float = 1e-3  # of log(r + epsilon), at the beginning
+    final_epsilon: float = 1e-3  # and at the end; the larger, the more it is the sum of rewards itself
+    penalty: float = 0.0  # weight of the violation cost in the objective
+    hidden: tuple[int, ...] = (64, 64)
+    gradient_norm: float = 1.0  # to which gradients are clipped
+
+
+@dataclass(frozen=True, slots=True)
+class DaggerOptions:
+    """Hyperparameters of DAgger."""
+
+    expert: str = ""  # a policy, or a trained one; sdc-nmpc for one vehicle, consensus-mpc for formations
+    rows: int = 64  # flights, or vehicles of all teams
+    window: int = 20  # steps of each row between fits
+    expert_flies: float = 0.2  # share of the budget in which the rows that the expert flies fall to none
+    fits: int = 40  # minibatches after each window at the beginning
+    final_fits: int = 200  # and at the end of the budget, when there are many labels
+    batch: int = 512
+    learning_rate: float = 3e-3
+    final_rate: float = 0.02  # share of the learning rate at the end of the budget
+    threshold: float = 0.05  # of an output's error, up to which the loss is quadratic
+    hidden: tuple[int, ...] = (64, 64)
+    squash: Squash = "tanh"  # how outputs come into [-1, 1]; "clip" as PPO, which can then go on from here
+    stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for the usual ones
+    separation: float | None = None  # m, that the expert of a team keeps; None for the task's own
+    episode_steps: int | None = None  # of a team's flight in training; None for the task's own
 
 
 @dataclass(frozen=True, slots=True)
