@@ -1,0 +1,35 @@
+"""What a wheel holds: every file of the packages, by the lists of pyproject.toml."""
+
+import sys
+from pathlib import Path
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).parent.parent
+SETUPTOOLS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
+FILES = [
+    path.relative_to(ROOT)
+    for package in ("quad_envs", "controllers", "baselines")
+    for path in sorted((ROOT / package).rglob("*"))
+    if path.is_file() and "__pycache__" not in path.parts
+]
+
+
+def test_every_folder_is_listed_so_that_setuptools_neither_warns_nor_leaves_it_out():
+    folders = {path.parent for path in FILES} | {path.parent.parent for path in FILES} - {Path()}
+    # Folders with other names, as those of the shipped policies, cannot be packages; they are data.
+    wanted = {".".join(folder.parts) for folder in folders if all(map(str.isidentifier, folder.parts))}
+    assert wanted == set(SETUPTOOLS["packages"])
+
+
+def test_every_file_that_is_no_code_is_named_as_data():
+    data = {
+        path
+        for package, patterns in SETUPTOOLS["package-data"].items()
+        for pattern in patterns
+        for path in (ROOT / package.replace(".", "/")).glob(pattern)
+    }
+    assert [path for path in FILES if path.suffix != ".py" and ROOT / path not in data] == []
