@@ -86,6 +86,7 @@ class TrainOptions:
     hyper: Annotated[list[str], "hyperparameter of the algorithm; JSON, else text"] = field(
         default_factory=list
     )
+    from_: Annotated[str, "begin with the network of a checkpoint: its folder, or a shipped policy"] = ""
     resume: Annotated[bool, "go on with the run in the folder: its weights, counters and curve"] = False
     fresh: Annotated[bool, "discard the run that is in the folder"] = False
     json: Annotated[bool, "print JSON"] = False
@@ -173,11 +174,14 @@ def add_options(parser: argparse.ArgumentParser, kind: type[Any]) -> None:
             settings |= {"action": "append", "metavar": "KEY=VALUE"}
         elif hint is not bool:
             settings["metavar"] = {int: "N", float: "S", Path: "FOLDER"}.get(settings["type"], "NAME")
-        parser.add_argument(entry.name if positional else _flag(entry.name), **settings)
+        if positional:
+            parser.add_argument(entry.name, **settings)
+        else:
+            parser.add_argument(_flag(entry.name), dest=entry.name, **settings)
 
 
 def _flag(name: str) -> str:
-    return "--" + name.replace("_", "-")
+    return "--" + name.rstrip("_").replace("_", "-")  # `from_`, since Python keeps `from` for itself
 
 
 def read_options(kind: type[Options], found: argparse.Namespace) -> Options:

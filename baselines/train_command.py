@@ -34,6 +34,7 @@ def train_one(options: TrainOptions) -> int:
                 out=out,
                 env_kwargs=env_kwargs,
                 hyper=hyper,
+                start_from=options.from_ or None,
                 resume=options.resume,
                 fresh=options.fresh,
                 watcher=display,
@@ -74,6 +75,7 @@ def resume_command(options: TrainOptions, out: Path) -> str:
             str(out),
             options.set,
             options.hyper,
+            options.from_,
         )
         + " --resume"
     )

@@ -80,7 +80,7 @@ def load_policy(source: str | os.PathLike[str], env: Any) -> NetworkPolicy:
     from .training.checkpoints import load_checkpoint
     from .training.networks import NetworkPolicy
 
-    folder = _folder(source)
+    folder = checkpoint_folder(source)
     network, said = load_checkpoint(folder)
     task = task_of(env)
     where, mission = f"checkpoint {str(folder)!r}", said.get("mission")
@@ -96,8 +96,15 @@ def load_policy(source: str | os.PathLike[str], env: Any) -> NetworkPolicy:
         raise CheckpointError(f"{where} does not fit {task.env_id}: {error}") from error
 
 
-def _folder(source: str | os.PathLike[str]) -> Path:
-    """Where the checkpoint is."""
+def checkpoint_folder(source: str | os.PathLike[str]) -> Path:
+    """Where a checkpoint is.
+
+    Args:
+        source: Its folder, or a name of `shipped_policies`.
+
+    Raises:
+        CheckpointError: If there is none.
+    """
     text = os.fspath(source)
     if not isinstance(source, os.PathLike) and (SHIPPED / text / _DESCRIPTION).is_file():
         return SHIPPED / text

@@ -20,6 +20,7 @@ class StubOptions:
     rows: int = 100
     fails_at: int = 0
     how: str = ""
+    follows: bool = False  # hands out the network that it begins with
 
 
 class Progress(NamedTuple):
@@ -43,10 +44,8 @@ def stub(task_options, options, seed, spent, start=None):
         bias += options.gain * rng.normal(size=4) / (1 + update)
         weights = np.zeros((len(features.names), 4), np.float32)
         reward = np.inf if options.how == "infinite" and update == options.fails_at else 0.5
-        yield (
-            Progress(update, options.rows * update, reward),
-            Network(features, (weights,), (bias.astype(np.float32),)),
-        )
+        drawn = Network(features, (weights,), (bias.astype(np.float32),))
+        yield Progress(update, options.rows * update, reward), start if options.follows else drawn
         if start is not None:
             assert len(start.weights) == 1
 

@@ -1,5 +1,7 @@
 """Imitation and the analytic policy gradient: labels, who flies, and the scores that both reach."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -151,6 +153,14 @@ def test_a_network_with_other_layers_is_no_start():
     wrong, steps = still(task_of(HELIX)), iter([0.0, 1.0])
     with pytest.raises(ValueError, match="give the same hidden sizes"):
         next(dagger(training_options(HELIX, {}), DaggerOptions(expert="lqr"), 0, lambda: next(steps), wrong))
+
+
+def test_a_network_that_sees_something_else_is_no_start():
+    options, steps = DaggerOptions(expert="lqr", hidden=(8,), rows=4, window=1, fits=1), iter([0.0, 1.0])
+    _, own = next(dagger(training_options(HELIX, {}), options, 0, lambda: next(steps)))
+    scaled = replace(own, features=replace(own.features, scale=tuple(2.0 * s for s in own.features.scale)))
+    with pytest.raises(ValueError, match="sees other features"):
+        next(dagger(training_options(HELIX, {}), options, 0, lambda: 0.0, scaled))
 
 
 def test_training_flies_from_no_start_that_is_held_out():

@@ -100,6 +100,20 @@ def test_an_interrupted_run_saves_and_goes_on(tmp_path):
     assert len(config["commands"]) == 1 and load_checkpoint(tmp_path / "last")[1]["resumed"] == 1
 
 
+def test_a_run_may_begin_with_the_network_of_another_and_says_with_which(tmp_path, capsys):
+    first, begun = run(tmp_path / "a", steps=200).folder, str(tmp_path / "b")
+    arguments = ["train", HELIX, "stub", "--steps", "200", "--set", "time_limit=1.0", "--out", begun]
+    assert main([*arguments, "--from", str(first), "--hyper", "follows=true"]) == 0
+    (network, said), (start, origin) = load_checkpoint(tmp_path / "b" / "last"), load_checkpoint(first)
+    assert np.array_equal(network.biases[0], start.biases[0]), "the stub hands out what it was given"
+    assert said["updates"] == 2 and said["start_from"]["digest"] == origin["digest"]
+    assert said["made_by"].endswith(f"--from {first}")
+    capsys.readouterr()
+    again = [*arguments, "--hyper", "follows=true", "--resume", "--steps", "300"]
+    assert main(again) == 2 and "its start_from is" in capsys.readouterr().err
+    assert main([*again, "--from", str(first)]) == 0
+
+
 def test_a_finished_run_goes_on_with_a_larger_budget_only(tmp_path):
     first = run(tmp_path)
     with pytest.raises(ResultsError, match=r"has used .* all of 1000 steps: give more"):
@@ -177,10 +191,12 @@ def test_files_of_others_are_left_alone(tmp_path):
         ({"hyper": {"hidden": 3}}, "hidden of 'stub' must be a list"),
         ({"env_kwargs": {"kapa": 1.0}}, "did you mean 'kappa'"),
         ({"algorithm": "once", "resume": True}, "'once' cannot go on from a saved network"),
+        ({"algorithm": "once", "start_from": "apg-helix"}, "'once' cannot go on from a saved network"),
+        ({"start_from": "apg-helx"}, "there is no folder 'apg-helx'"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_written(tmp_path, arguments, message):
-    with pytest.raises((ValueError, ResultsError), match=message):
+    with pytest.raises((ValueError, ResultsError, CheckpointError), match=message):
         run(tmp_path / "run", **arguments)
     assert not (tmp_path / "run" / "config.json").exists()
 

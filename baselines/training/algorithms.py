@@ -143,3 +143,16 @@ def options_of(name: str) -> type[Any]:
 def resumable(name: str) -> bool:
     """Whether an algorithm can go on from a network."""
     return "start" in inspect.signature(generator_of(name)).parameters
+
+
+def require_resumable(name: str) -> None:
+    """Check that an algorithm can go on from a network.
+
+    Raises:
+        ValueError: If not.
+    """
+    if not resumable(name):
+        raise ValueError(
+            f"{name!r} cannot go on from a saved network: its critic and its data are not saved; "
+            "train anew with a larger budget (--fresh)"
+        )

@@ -17,6 +17,7 @@ def training_command(
     out: str = "",
     env_set: Sequence[str] = (),
     hyper: Sequence[str] = (),
+    start_from: str = "",
 ) -> str:
     """`quad-envs train ...`, quoted for a shell.
 
@@ -29,6 +30,7 @@ def training_command(
         out: Folder, if named.
         env_set: Keyword arguments of the environment as KEY=VALUE.
         hyper: Hyperparameters as KEY=VALUE.
+        start_from: Checkpoint whose network it begins with, if any.
     """
     words = ["quad-envs", "train", env_id, algorithm, "--seed", str(seed)]
     words += [] if seconds is None else ["--seconds", f"{seconds:g}"]
@@ -36,6 +38,7 @@ def training_command(
     words += ["--out", out] if out else []
     words += [word for text in env_set for word in ("--set", text)]
     words += [word for text in hyper for word in ("--hyper", text)]
+    words += ["--from", start_from] if start_from else []
     return shlex.join(words)
 
 

@@ -194,7 +194,7 @@ def train(
     features, outputs = flights.features, flights.outputs
     actor = Actor(len(features.names), options.hidden, outputs, options.squash)
     if start is not None:
-        actor.load(start)
+        actor.load(start, features)
     labels, rng = Labels(len(features.names), outputs), np.random.default_rng([_STREAM, seed, 1])
     optimizer = torch.optim.Adam(actor.parameters, lr=options.learning_rate)
     network, update = Network(features, *actor.arrays(), squash=options.squash), 0

@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 
 from ..errors import ResultsError
 from ..policy import mission_of
-from .algorithms import algorithm_for, require_packages
+from ..trained import checkpoint_folder
+from .algorithms import algorithm_for, require_packages, require_resumable
+from .checkpoints import load_checkpoint
 from .clock import Budget
 from .command_line import assignments, training_command
 from .held_out import Point, read_point, training_options
@@ -17,6 +19,7 @@ from .hyperparameters import hyperparameters, plain_options
 from .networks import Network
 from .run_folder import RunFolder
 
+_ORIGIN = ("env_id", "algorithm", "seed", "steps", "digest")  # what is said of a network to begin with
 _SEEDS = 5_000  # training seeds lie below; rows of a vector environment count on from there
 
 
@@ -32,6 +35,7 @@ class Plan:
     task_options: Any  # TrackingOptions or options of a team
     options: Any  # hyperparameters
     about: dict[str, Any]  # as config.json says it
+    network: Network | None = None  # to begin with
 
     def folder(self, path: Path) -> RunFolder:
         """The folder of the run."""
@@ -53,18 +57,19 @@ class Start(NamedTuple):
 def make_plan(
     env_id: str,
     algorithm: str,
-    *,
     seed: int = 0,
     seconds: float | None = None,
     steps: int | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     hyper: Mapping[str, Any] | None = None,
+    start_from: str | Path | None = None,
 ) -> Plan:
     """A training, its arguments as those of `train`.
 
     Raises:
         ValueError: If an argument is not allowed or the algorithm cannot act on the task.
         MissingPackageError: If what the algorithm needs is not installed.
+        CheckpointError: If there is no checkpoint where it is to begin.
     """
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < _SEEDS:
         raise ValueError(
@@ -79,7 +84,8 @@ def make_plan(
     require_packages(algorithm)
     env_id = env_id.removeprefix("quad_envs:")
     options = hyperparameters(algorithm, env_id, hyper)
-    texts = assignments(kwargs), assignments(hyper or {})
+    network, origin = (None, None) if start_from is None else _origin(start_from, algorithm)
+    texts = assignments(kwargs), assignments(hyper or {}), str(start_from or "")
     about = {
         "env_id": env_id,
         "env_kwargs": {key: value if _is_plain(value) else repr(value) for key, value in kwargs.items()},
@@ -88,9 +94,17 @@ def make_plan(
         "kind": entry.kind,
         "seed": seed,
         "hyperparameters": plain_options(options),
+        "start_from": origin,
         "made_by": training_command(env_id, algorithm, seed, budget.seconds, budget.steps, "", *texts),
     }
-    return Plan(env_id, kwargs, algorithm, seed, budget, task_options, options, about)
+    return Plan(env_id, kwargs, algorithm, seed, budget, task_options, options, about, network)
+
+
+def _origin(source: str | Path, algorithm: str) -> tuple[Network, dict[str, Any]]:
+    """The network to begin with, and what made it."""
+    require_resumable(algorithm)
+    network, said = load_checkpoint(checkpoint_folder(source))
+    return network, {name: said[name] for name in _ORIGIN if name in said}
 
 
 def _is_plain(value: Any) -> bool:

@@ -20,7 +20,7 @@ from ..errors import TrainingError
 from .algorithm_options import PolicyGradientOptions
 from .flights import DifferentiableFlights
 from .held_out import Progress
-from .networks import Floats, Network, Squash, hover_actions, hover_slopes
+from .networks import Features, Floats, Network, Squash, hover_actions, hover_slopes
 
 
 class Actor:
@@ -53,11 +53,11 @@ class Actor:
         x = self.layers[-1](x)
         return fast_tanh(x) if self.squash == "tanh" else x
 
-    def load(self, network: Network) -> None:
+    def load(self, network: Network, features: Features) -> None:
         """Take over the weights of a network.
 
         Raises:
-            ValueError: If it has other layers.
+            ValueError: If it has other layers, or sees something else than `features`.
         """
         import torch
 
@@ -66,6 +66,11 @@ class Actor:
             raise ValueError(
                 f"cannot go on from layers {[W.shape for W in network.weights]} ({network.squash}) with "
                 f"layers {shapes} ({self.squash}): give the same hidden sizes and squash"
+            )
+        if network.features != features:
+            raise ValueError(
+                "cannot go on from a network that sees other features, or scales them otherwise: begin with "
+                "one of the same task, preview and stages"
             )
         with torch.no_grad():
             for layer, W, b in zip(self.layers, network.weights, network.biases, strict=True):
@@ -136,7 +141,7 @@ def train(
     flights = DifferentiableFlights(task_options, options.flights, seed)
     actor = Actor(len(flights.features.names), options.hidden, 4)
     if start is not None:
-        actor.load(start)
+        actor.load(start, flights.features)
     optimizer = torch.optim.Adam(actor.parameters, lr=options.learning_rate)
     update, steps = 0, 0
     while (share := spent()) < 1.0:

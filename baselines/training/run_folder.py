@@ -24,6 +24,7 @@ from .held_out import Point, read_point
 from .networks import Network
 
 _IDENTITY = ("env_id", "env_kwargs", "algorithm", "seed", "hyperparameters")  # a resumed run must agree
+_ORIGIN = "start_from"  # and this, which older runs do not say
 _FILES = (WEIGHTS, DESCRIPTION, "curve.csv", "config.json")
 
 
@@ -82,7 +83,7 @@ class RunFolder:
                 f"{str(self.path)!r} holds no training that could be resumed; leave --resume out"
             )
         asked = plain_json(self.about)
-        differing = [name for name in _IDENTITY if found.get(name) != asked.get(name)]
+        differing = [name for name in (*_IDENTITY, _ORIGIN) if found.get(name) != asked.get(name)]
         if differing:
             name = differing[0]
             raise ResultsError(

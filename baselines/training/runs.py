@@ -14,7 +14,7 @@ from typing import Any
 
 from ..errors import CheckpointError, ResultsError, TrainingError
 from ..results import locked
-from .algorithms import generator_of, resumable
+from .algorithms import generator_of, require_resumable
 from .clock import TrainingClock
 from .held_out import CHOOSING, HeldOutFlights, Point, Progress, better
 from .networks import Network
@@ -66,6 +66,7 @@ def train(
     out: str | Path | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     hyper: Mapping[str, Any] | None = None,
+    start_from: str | Path | None = None,
     resume: bool = False,
     fresh: bool = False,
     watcher: Watcher | None = None,
@@ -85,6 +86,8 @@ def train(
         out: Folder; `default_folder` if not given.
         env_kwargs: Of the environment.
         hyper: Hyperparameters that differ from the committed ones.
+        start_from: Checkpoint, or shipped policy, whose network it begins with: with the features, the hidden
+            layers and the squash of this training.
         resume: Go on with the run in the folder until the whole budget is used. The weights, the counters,
             the learning rate's place in its schedule and the curve are restored; the optimiser's averages,
             a critic, collected data and the random streams begin anew.
@@ -100,9 +103,7 @@ def train(
     """
     if resume and fresh:
         raise ValueError("either resume or fresh: a run that is discarded cannot go on")
-    plan = make_plan(
-        env_id, algorithm, seed=seed, seconds=seconds, steps=steps, env_kwargs=env_kwargs, hyper=hyper
-    )
+    plan = make_plan(env_id, algorithm, seed, seconds, steps, env_kwargs, hyper, start_from)
     path = default_folder(env_id, algorithm, seed) if out is None else Path(out)
     held_out = HeldOutFlights(env_id, plan.env_kwargs)
     with locked(path):
@@ -111,7 +112,7 @@ def train(
             start = _resume(folder, plan)
         else:
             folder.begin(fresh)
-            start = Start()
+            start = Start(plan.network)
         run = _Run(folder, plan, held_out, start, watcher)
         run.go()
         return TrainingResult(path, plan.env_id, algorithm, seed, run.best_point(), tuple(run.curve))
@@ -119,11 +120,7 @@ def train(
 
 def _resume(folder: RunFolder, plan: Plan) -> Start:
     """Where the run in the folder goes on."""
-    if not resumable(plan.algorithm):
-        raise ValueError(
-            f"{plan.algorithm!r} cannot go on from a saved network: its critic and its data are not saved; "
-            "train anew with a larger budget (--fresh)"
-        )
+    require_resumable(plan.algorithm)
     start = read_start(folder)
     if plan.budget.share(start.seconds, start.steps) >= 1.0:
         raise ResultsError(
