@@ -124,6 +124,12 @@ def test_a_page_says_each_verdict_in_words(word, drawn):
     assert f'<h3>a claim</h3><span class="verdict {word.lower()}">{word}</span>' in text
 
 
+def test_a_verdict_on_our_own_finding_is_not_taken_for_one_on_the_text(drawn):
+    plate = drawn[1]._replace(key="beyond-x", verdict="HOLDS")
+    text = page.render([Section("beyond", "Beyond", [], [], (plate,))], drawn[0])
+    assert "our finding HOLDS" in text and "0 HOLDS</span></dt>" in text
+
+
 def test_a_page_loads_nothing_and_its_policy_allows_its_own_style_alone(drawn):
     text = page.render([a_section(drawn)], drawn[0])
     style = re.search(r"<style>(.*)</style>", text, re.DOTALL)[1]

@@ -70,7 +70,7 @@ def render(sections: Sequence[Section], folder: Path, missing: Sequence[str] = (
 
 
 def _head(sections: Sequence[Section], missing: Sequence[str]) -> str:
-    total = Counter(word for section in sections for word in _words(section))
+    total = Counter(word for section in sections if section.name != "beyond" for word in _words(section))
     meaning = "".join(
         f"<dt>{_badge(word, f'{total[word]} {word}')}</dt><dd>{escape(text)}</dd>"
         for word, text in VERDICTS.items()
@@ -185,7 +185,9 @@ def _claim(claim: Claim) -> str:
 
 
 def _plate(plate: Plate, folder: Path, known: set[str]) -> str:
-    label = f"Figure {plate.key}: {plate.title}" if plate.key[:1].isdigit() else plate.title
+    printed = plate.key[:1].isdigit()
+    label = f"Figure {plate.key}: {plate.title}" if printed else plate.title
+    badge = _badge(plate.verdict, "" if printed else f"our finding {plate.verdict}")
     links = ", ".join(
         f'<a href="{escape(name)}">{escape(Path(name).suffix[1:].upper())}</a>' for name in plate.files
     )
@@ -196,7 +198,7 @@ def _plate(plate: Plate, folder: Path, known: set[str]) -> str:
     related = f" See also the claims {claims}." if claims else ""
     return (
         f'<figure class="card" id="figure-{escape(plate.key)}"><div class="head"><h3>{escape(label)}</h3>'
-        f"{_badge(plate.verdict)}</div><p><b>The text:</b> {escape(plate.printed)}</p>"
+        f"{badge}</div><p><b>The text:</b> {escape(plate.printed)}</p>"
         f"{_image(folder / plate.files[0], label)}<figcaption><p>{escape(plate.caption)}</p>"
         f"{_numbers(plate.numbers)}<p class='soft'>{links}.{related}</p></figcaption></figure>"
     )
