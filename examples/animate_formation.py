@@ -42,7 +42,9 @@ def main() -> None:
         observations, *_ = team.step(dict(zip(team.agents, actions, strict=True)))
         if (step + 1) % arguments.every == 0:
             frames.append(team.render())
-    colours = Image.fromarray(np.concatenate(frames[:: len(frames) // 4])).quantize(64)  # one palette for all
+    colours = Image.fromarray(np.concatenate(frames[:: max(1, len(frames) // 4)])).quantize(
+        64
+    )  # one palette for all
     images = [Image.fromarray(frame).quantize(palette=colours, dither=Image.Dither.NONE) for frame in frames]
     shown = round(1000 * arguments.every * 0.05 / 2.0)  # ms: twice as fast as it flies
     images[0].save(

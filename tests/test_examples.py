@@ -15,6 +15,7 @@ EXAMPLES = {
     "supersuit_sb3": (["supersuit", "stable_baselines3"], ["--steps", "1536"], "consensus-mpc: score 0."),
     "torchrl_ppo": (["torchrl"], ["--updates", "1"], "update 1: mean reward 0."),
     "rllib_formation": (["ray.rllib"], ["--iterations", "1", "--batch", "1000"], "1000 steps, score 0."),
+    "animate_formation": ([], ["--steps", "8", "--out", "{tmp}/short.gif"], "3 frames in "),
     "your_own_task": ([], ["--episodes", "1"], "sdc-nmpc on quad/HelixTracking-v0"),
 }
 
@@ -37,9 +38,9 @@ def run(name, *arguments):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_an_example_runs_to_its_end(name):
+def test_an_example_runs_to_its_end(name, tmp_path):
     _, arguments, last = EXAMPLES[name]
-    assert last in run(name, *arguments)
+    assert last in run(name, *(text.format(tmp=tmp_path) for text in arguments))
 
 
 @pytest.mark.slow

@@ -49,6 +49,15 @@ SHORT = {"reference": "random", "time_limit": 1.0, "preview": 3}
 SMALL = PpoOptions(rows=8, horizon=16, batch=64, epochs=2, hidden=(16, 16))
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    """As in a run: two threads on networks this small wait for each other, on busy cores for minutes."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 def random_outputs(rng, rows, size=4):
     return rng.uniform(-1.0, 1.0, (rows, size)).astype(np.float32)
 
