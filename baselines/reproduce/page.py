@@ -81,10 +81,10 @@ def _head(sections: Sequence[Section], missing: Sequence[str]) -> str:
         else ""
     )
     return f"""<h1>The dissertation, reproduced</h1>
-<p>Every table, claim and figure of chapters 4 to 7 of <cite>Model Predictive Control for Cooperative Control
-and Estimation</cite> (2017) beside what our flights give, each with a verdict computed from the numbers under
-it, and the command that repeats it. Figures are redrawn from our own flights: the source has their data
-as pictures only.</p>
+<p>Every table, claim and figure of chapters 4 to 7 of <cite>Nonlinear Model Predictive Control
+for Cooperative Control and Estimation</cite> (2017) beside what our flights give, each with a verdict
+computed from the numbers under it, and the command that repeats it. Figures are redrawn from our own
+flights: the source has their data as pictures only.</p>
 <dl class="meaning">{meaning}</dl>{note}"""
 
 
