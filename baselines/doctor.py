@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
 import platform
+import warnings
 from collections.abc import Callable
 from importlib import metadata
 from importlib.util import find_spec
@@ -86,21 +86,19 @@ def _shadowing() -> Finding:
 
 def _cache() -> Finding:
     """Whether compiled kernels can be kept."""
-    from quad_envs.reward import stage_cost_kernel  # any kernel
+    from numba.core import config
 
-    outer = getattr(stage_cost_kernel, "entry", None)  # the one that Python calls, and that is cached
-    if outer is None:
-        return Finding("cache", False, "kernels are not compiled: is NUMBA_DISABLE_JIT set?")
-    if outer.stats.cache_path is None:
-        return Finding("cache", False, "kernels are not kept, every process compiles anew")
-    place = path = Path(outer.stats.cache_path)
-    while not place.exists():
-        place = place.parent
-    ok = os.access(place, os.W_OK)
-    remedy = (
-        "" if ok else ": not writable, every process compiles anew; set NUMBA_CACHE_DIR to a folder that is"
-    )
-    return Finding("cache", ok, f"{path}{remedy}")
+    from quad_envs._kernel_cache import folder
+
+    if getattr(config, "DISABLE_JIT", False):
+        return Finding("cache", False, "kernels are not compiled: unset NUMBA_DISABLE_JIT")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the finding says it
+        place = folder()
+    if place is None:
+        remedy = "no folder can be written, every process compiles anew; set NUMBA_CACHE_DIR to one that can"
+        return Finding("cache", False, remedy)
+    return Finding("cache", True, str(place))
 
 
 def _self_test() -> Finding:
