@@ -172,7 +172,7 @@ def test_a_private_name_that_is_missing_is_found_at_the_import_and_named(monkeyp
 
     monkeypatch.delattr(CPUCodeLibrary, "_finalize_dynamic_globals")
     monkeypatch.delitem(sys.modules, "quad_envs._nested")
-    with pytest.raises(ImportError, match="no CPUCodeLibrary._finalize_dynamic_globals"):
+    with pytest.raises(ImportError, match=r"no CPUCodeLibrary\._finalize_dynamic_globals"):
         importlib.import_module("quad_envs._nested")
 
 
