@@ -14,7 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from controllers.estimation.trilateration import MAX_RATIO, acceptance_limits
+from controllers.estimation.ekf import Restart
+from controllers.estimation.trilateration import acceptance_limits
+from controllers.estimation.trilateration_kernels import MAX_RATIO
 from quad_envs.agent_observations import N_ESTIMATE
 from quad_envs.envs.team_kernel import ESTIMATE_REACH, ESTIMATE_SPEED
 from quad_envs.parameters import Array
@@ -84,12 +86,12 @@ class TargetEstimator:
             raise ValueError(f"q must be finite and >= 0 m^2/s^3, got {q!r}")
         self.task, self.q, self.trilaterates = task, float(density), trilaterate
         position, velocity = task.prior_sigma
-        message = task.layout.comm_size
-        data = FilterData(self.q, task.dt, position**2, velocity**2, message, MAX_RATIO)
+        prior = Restart(task.prior_velocity, (position,) * 3 + (velocity,) * 3)
+        data = FilterData(self.q, task.dt, task.layout.comm_size, MAX_RATIO)
         m, rows = 1 + task.layout.neighbours, sensor_rows(task.sensor)
         self._starts = part_starts(task.layout)
         self._constants = (
-            np.array(task.prior_velocity, dtype=np.float64),
+            prior.data(),
             np.array(task.sensor_sigma, dtype=np.float64),
             np.int64(rows),
             task.params.coefficients(),

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.consensus_kernels import inertial_velocity, turn_to_inertial
-from controllers.estimation.ekf_kernels import ekf_scratch, ekf_update_kernel, predict_kernel
+from controllers.estimation.ekf_kernels import NIS_LIMIT, ekf_scratch, ekf_update_kernel, predict_kernel
 from controllers.estimation.kalman import kalman_scratch, kalman_update_kernel
+from controllers.estimation.restart_kernels import begin_anew
 from controllers.estimation.trilateration_kernels import (
     ACCEPTED,
     TRILATERATION_SCRATCH,
@@ -40,8 +41,6 @@ class FilterData(NamedTuple):
 
     q: float  # m^2/s^3
     dt: float  # s
-    variance: float  # of the prior position, m^2
-    velocity_variance: float  # m^2/s^2
     message: int  # numbers in a comm slot
     max_ratio: float  # of the geometry test of a trilateration
 
@@ -65,13 +64,13 @@ def _own_motion(plant: Array, disturbance: Array, coefficients: Array, out: Arra
 
 
 @kernel
-def _begin(slot: Array, velocity: Array, data: FilterData, x: Array, covariance: Array) -> None:
+def _begin(slot: Array, prior: Array, x: Array, covariance: Array) -> None:
     """The prior of an episode: the target where the slot says, at the task's guess of its velocity."""
     for a in range(3):
-        x[a], x[3 + a] = -slot[a], velocity[a]
+        x[a], x[3 + a] = -slot[a], prior[a]
+    for a in range(6):
         for b in range(6):
-            covariance[a, b], covariance[3 + a, b] = 0.0, 0.0
-        covariance[a, a], covariance[3 + a, 3 + a] = data.variance, data.velocity_variance
+            covariance[a, b] = prior[3 + a] if a == b else 0.0
 
 
 @kernel
@@ -146,13 +145,15 @@ def _update_by_fix(
     sigma: Array,
     limits: Array,
     data: FilterData,
+    prior: Array,
     x: Array,
     covariance: Array,
     scratch: Array,
 ) -> tuple[float, bool]:
     """Trilaterate the ranges and take the position over; NIS and whether it was done.
 
-    A range made `age` ago at p counts as one made now at p + age v, which is as far from the target.
+    A range made `age` ago at p counts as one made now at p + age v, which is as far from the target. A filter
+    that is lost (NIS_LIMIT) begins anew at the fix.
     """
     m = z.shape[0]
     distance, moved, scratch = scratch[:m], scratch[m : 4 * m].reshape(m, 3), scratch[4 * m :]
@@ -174,6 +175,12 @@ def _update_by_fix(
     for a in range(3):
         nu[a] = fix[a] - x[a]
     nis, failed = kalman_update_kernel(x, covariance, nu, H, C, scratch)
+    if nis > NIS_LIMIT * _POINT:
+        begin_anew(x, covariance, prior)
+        for a in range(3):
+            x[a] = fix[a]
+            for b in range(3):
+                covariance[a, b] = C[a, b]
     return nis, failed < 0
 
 
@@ -186,7 +193,7 @@ def filter_row(
     slot: Array,
     memory: Array,
     report: Array,
-    velocity: Array,
+    prior: Array,
     sigma: Array,
     rows: Int,
     coefficients: Array,
@@ -205,7 +212,7 @@ def filter_row(
         slot: Wanted position relative to the target, (3,).
         memory: Of the agent, (FILTER_SIZE,), changed in place; zeros begin an episode.
         report: Output, (N_REPORT,).
-        velocity: Prior of the target's velocity, (3,).
+        prior: `Restart.data` of the task's prior, (9,): how an episode and a lost filter begin.
         sigma: Of range, azimuth, elevation, (3,).
         rows: 1 or 3.
         coefficients: QuadrotorParams.coefficients().
@@ -220,7 +227,7 @@ def filter_row(
     age, motion, rest = scratch[6 * m : 7 * m], scratch[7 * m : 7 * m + 6], scratch[7 * m + 6 :]
     _own_motion(plant, disturbance, coefficients, motion)
     if memory[STAGE] == 0.0:
-        _begin(slot, velocity, data, x, covariance)
+        _begin(slot, prior, x, covariance)
         memory[STAGE] = 1.0
     else:
         _follow(motion, memory, data, x, covariance)
@@ -232,11 +239,11 @@ def filter_row(
         memory[STAGE] = 2.0
     report[2], report[3] = float(held), 0.0
     if limits is not None:
-        nis, done = _update_by_fix(z, place, age, valid, sigma, limits, data, x, covariance, rest)
+        nis, done = _update_by_fix(z, place, age, valid, sigma, limits, data, prior, x, covariance, rest)
         if done:
             report[0], report[1], report[3] = nis, 3.0, 1.0
             return
-    nis, used, _ = ekf_update_kernel(x, covariance, z, place, age, valid, sigma, rows, rest)
+    nis, used, _, _ = ekf_update_kernel(x, covariance, z, place, age, valid, sigma, rows, prior, True, rest)
     report[0], report[1] = nis if used > 0 else math.nan, float(used)
 
 
@@ -259,7 +266,7 @@ def decode_and_filter(
     first: Array,
     filters: Array,
     reports: Array,
-    velocity: Array,
+    prior: Array,
     sigma: Array,
     rows: Int,
     coefficients: Array,
@@ -288,6 +295,6 @@ def decode_and_filter(
         comm = comms[j].reshape(comms.shape[1] // data.message, data.message)
         filter_row(
             plants[j], disturbances[j], comm, measured[j].reshape(m, N_MEASURED), slots[j], filters[j],
-            reports[j], velocity, sigma, rows, coefficients, limits, data, valid, scratch,
+            reports[j], prior, sigma, rows, coefficients, limits, data, valid, scratch,
         )  # fmt: skip
     return bad

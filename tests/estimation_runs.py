@@ -155,11 +155,49 @@ def rows_of(x, z, position, age, rows, wrap=True, overhead=True):
     return [np.concatenate(part) for part in zip(*parts, strict=True)]
 
 
-def readable_update(x, P, nu, H, variance):
-    S = H @ P @ H.T + np.diag(variance)
+def readable_update(x, P, nu, H, R):
+    R = np.diag(R) if R.ndim == 1 else R
+    S = H @ P @ H.T + R
     K = np.linalg.solve(S, H @ P).T
     A = np.eye(6) - K @ H
-    return x + K @ nu, A @ P @ A.T + K @ np.diag(variance) @ K.T, nu @ np.linalg.solve(S, nu)
+    return x + K @ nu, A @ P @ A.T + K @ R @ K.T, nu @ np.linalg.solve(S, nu)
+
+
+def curved(x, P, position, age, nu, H, variance):
+    """Second order of ranges: the mean and the covariance of d'D d / 2 with d ~ N(0, P)."""
+    DP = []
+    for p_j, age_j in zip(position, age, strict=True):
+        d = x[:3] - age_j * x[3:] - p_j
+        rho = np.linalg.norm(d)
+        DP.append((np.eye(3) - np.outer(d, d) / rho**2) / rho @ P[:3, :3])
+    bias = [0.5 * np.trace(a) for a in DP]
+    more = [[0.5 * np.trace(a @ b) for b in DP] for a in DP]
+    return nu - bias, H, np.diag(variance) + np.array(more)
+
+
+def measured_point(z, position, age, v):
+    rho, az, el = z
+    ray = rho * np.array([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), -np.sin(el)])
+    return position + ray + age * v
+
+
+def readable_restart(z, position, age, restart):
+    """The filter that begins anew at the most central measurement, updated with the others."""
+    v, variance = np.array(restart.rest), np.square(restart.sigma)
+    points = np.array([measured_point(*one, v) for one in zip(z, position, age, strict=True)])
+    best = np.linalg.norm(points[:, None] - points, axis=-1).sum(axis=1).argmin()
+    J = np.array([(measured_point(z[best] + h, position[best], 0.0, v)
+                   - measured_point(z[best] - h, position[best], 0.0, v)) / 2e-6
+                  for h in 1e-6 * np.eye(3)]).T  # fmt: skip
+    P = np.diag(variance)
+    P[:3, :3] = J @ np.diag(SIGMA**2) @ J.T + age[best] ** 2 * np.diag(variance[3:])
+    x = np.concatenate([points[best], v])
+    others = np.delete(np.arange(len(z)), best)
+    if not len(others):
+        return x, P
+    parts = rows_of(x, z[others], position[others], age[others], 3)
+    new_x, new_P, nis = readable_update(x, P, *parts)
+    return (new_x, new_P) if nis <= 50.0 * len(parts[0]) else (x, P)
 
 
 def sweep(path, runs, rng, overhead=True, wrap=True):

@@ -142,8 +142,23 @@ def test_the_filter_is_consistent_with_three_ranges_from_the_start(vehicle, unti
     assert 0.8 < range_only().anees(vehicle, part) < 1.2
 
 
-def test_the_filter_is_too_sure_with_two_ranges():
-    assert range_only().anees(0, LATE) > 2.0
+def first_order(state, z, position, age, valid, sigma, rows):
+    return ekf.update(state, z, position, age, valid, sigma, rows, None, second_order=False)
+
+
+def too_sure(runs, vehicle, interval):
+    """Share of runs whose mean normalised error is above 10: a mean over runs says little with such tails."""
+    found = nees(runs.error[interval, :, vehicle], runs.P[interval, :, vehicle, :3, :3])
+    return (found.mean(axis=0) / 3.0 > 10.0).mean()
+
+
+def test_the_second_order_makes_filters_with_two_ranges_less_sure_of_a_wrong_place():
+    plain = fly(*scenario(), predict, 1, update=first_order)
+    pairs = [(0, LATE), (1, EARLY), (2, LATE), (3, EARLY), (3, MIDDLE)]
+    before = np.array([too_sure(plain, *pair) for pair in pairs])
+    after = np.array([too_sure(range_only(), *pair) for pair in pairs])
+    # 6, 15, 42, 17 and 53 % of 120 runs become 2, 7, 17, 7 and 38 %.
+    assert (after <= before).all() and after.mean() < 0.6 * before.mean()
 
 
 def by_trilateration(state, z, position, age, valid, sigma, rows):
@@ -189,7 +204,7 @@ def squared_range(constant):
         variance = np.full_like(rho2, s2) if constant else 4.0 * rho2 * s2 + 2.0 * s2**2
         new = kalman_update(state.x, state.P, nu, H, variance[:, :, None] * np.eye(z.shape[1]))
         rows = valid.sum(axis=1)
-        return ekf.TargetFilter(new.x, new.P), ekf.Innovation(new.nis, rows, 0 * rows)
+        return ekf.TargetFilter(new.x, new.P), ekf.Innovation(new.nis, rows, 0 * rows, rows < 0)
 
     return update
 
@@ -207,7 +222,7 @@ def test_a_squared_range_with_constant_noise_is_hopelessly_sure():
 
 def test_a_gain_without_measurement_noise_diverges():
     def update(state, z, position, age, valid, sigma, rows):
-        return ekf.update(state, z, position, age, valid, 1e-4 * np.asarray(sigma), rows)
+        return ekf.update(state, z, position, age, valid, 1e-4 * np.asarray(sigma), rows, None)
 
     runs = fly(*scenario(), predict, 1, update=update)
     assert runs.anees(0, LATE) > 1e4 and runs.rmse(0, EARLY) > 2.0 * range_only().rmse(0, EARLY)
@@ -301,6 +316,11 @@ def fuse(weights):
     return fused
 
 
+def never_restarting(*arguments):
+    """The bare filter: restarts would bring a fusion back that counts twice."""
+    return ekf.update(*arguments, None)
+
+
 @functools.cache
 def team(weights):
     """RMSE, m, and ANEES/3 of a ring in which each fuses its own angles and range with two neighbours."""
@@ -308,7 +328,7 @@ def team(weights):
     shared = np.array([[j in RING[i] for j in range(4)] for i in range(4)])
     mask = {"shared": shared, "central": np.ones((4, 4), dtype=bool)}.get(weights, own)
     fusion = None if weights in ("own", "shared", "central") else fuse(weights)
-    runs = fly(*scenario(40), predict, 3, lambda k: mask, fusion)
+    runs = fly(*scenario(40), predict, 3, lambda k: mask, fusion, never_restarting)
     error, P = runs.error[SETTLED], runs.P[SETTLED][..., :3, :3]
     return np.sqrt((error**2).sum(-1).mean()), anees(error, P)
 

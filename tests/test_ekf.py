@@ -7,6 +7,7 @@ from estimation_runs import (
     RAILS,
     SIGMA,
     START,
+    curved,
     cv_truth,
     fly,
     readable_update,
@@ -45,6 +46,8 @@ def test_the_update_agrees_with_its_readable_twin(rows):
         if not j.any():
             continue
         parts = rows_of(state.x[i], z[i, j], position[i, j], age[i, j], rows)
+        if rows == 1:
+            parts = curved(state.x[i], state.P[i], position[i, j], age[i, j], *parts)
         x, P, nis = readable_update(state.x[i], state.P[i], *parts)
         np.testing.assert_allclose(new.x[i], x, atol=1e-10)
         np.testing.assert_allclose(new.P[i], P, atol=1e-12)
@@ -138,14 +141,17 @@ def test_the_compiled_step_is_predict_shift_update():
     new, innovation = ekf.update(
         ekf.shift(ekf.predict(state, DT, 0.1), displacement), z, position, age, valid, SIGMA, 3
     )
+    restart = ekf.Restart().data()
     for i in range(4):
         x, P, scratch = state.x[i].copy(), state.P[i].copy(), np.full(ekf_scratch(3, 3), np.nan)
-        nis, rows, rejected = ekf_step_kernel(
-            x, P, DT, 0.1, displacement[i], z[i], position[i], age[i], valid[i], SIGMA, 3, scratch
-        )
+        nis, rows, rejected, lost = ekf_step_kernel(
+            x, P, DT, 0.1, displacement[i], z[i], position[i], age[i], valid[i], SIGMA, 3, restart, True,
+            scratch,
+        )  # fmt: skip
         np.testing.assert_array_equal(x, new.x[i])
         np.testing.assert_array_equal(P, new.P[i])
         assert (nis, rows, rejected) == (innovation.nis[i], innovation.rows[i], innovation.rejected[i])
+        assert not lost and not innovation.restarted[i]
 
 
 def test_an_azimuth_across_pi_is_wrapped():

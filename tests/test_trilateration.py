@@ -166,7 +166,8 @@ def test_three_ranges_are_too_few():
 
 
 def test_a_target_at_a_vehicle_is_found():
-    fix = trilaterate(RAILS[None], ranges(RAILS[1])[None], 0.1)
+    distance = np.maximum(ranges(RAILS[1]), 1e-9)  # a range of 0 is none
+    fix = trilaterate(RAILS[None], distance[None], 0.1)
     np.testing.assert_allclose(fix.r[0], RAILS[1], atol=1e-6)
 
 

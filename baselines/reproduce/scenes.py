@@ -131,9 +131,11 @@ Update = Callable[[Filter, Held], tuple[Filter, Array, NDArray[np.int64]]]
 
 
 def ekf_update(state: Filter, held: Held) -> tuple[Filter, Array, NDArray[np.int64]]:
-    """The update of this suite."""
+    """The update of this suite as the text has it: to the first order, and whatever was measured."""
     believed = ekf.TargetFilter(*state)
-    new, said = ekf.update(believed, held.z, held.places, None, held.valid, held.sigma, held.rows)
+    new, said = ekf.update(
+        believed, held.z, held.places, None, held.valid, held.sigma, held.rows, None, second_order=False
+    )
     return (new.x, new.P), said.nis, said.rows
 
 

@@ -29,9 +29,8 @@ from quad_envs.parameters import Array
 
 from .arguments import BoolArray, IntArray, as_floats, as_mask
 from .consistency import chi2_quantile
-from .trilateration_kernels import MIN_RANGES, TRILATERATION_SCRATCH, trilaterate_kernel
+from .trilateration_kernels import MAX_RATIO, MIN_RANGES, TRILATERATION_SCRATCH, trilaterate_kernel
 
-MAX_RATIO = 8.0  # of the largest and smallest singular value of the centred positions
 ACCEPTANCE = 0.999  # share of fixes with honest noise that pass the residual test
 
 
@@ -39,7 +38,7 @@ class Reason(IntEnum):
     """Why a fix was refused."""
 
     ACCEPTED = 0
-    TOO_FEW = 1  # fewer than four finite ranges
+    TOO_FEW = 1  # fewer than four finite ranges above 0
     GEOMETRY = 2  # the vehicles are nearly in one plane: a mirror twin is possible
     SINGULAR = 3  # the lines of sight do not determine a position: the target is too far, or in line
     RESIDUAL = 4  # the ranges contradict each other by more than their noise

@@ -12,11 +12,13 @@ from .arguments import BoolArray
 
 MIN_RANGES = 4
 TRILATERATION_SCRATCH = 3 * 3 + 2 * 9
+NEAREST_SCRATCH = TRILATERATION_SCRATCH
 ACCEPTED, TOO_FEW, GEOMETRY, SINGULAR, RESIDUAL = range(5)  # the members of Reason, for compiled code
 _STEPS = 50
 _SMALLEST_STEP = 1e-9  # m
 _SMALLEST_RANGE = 1e-9  # m, in divisions
 _LARGEST = 1e9  # m: what is beyond is a fault
+MAX_RATIO = 8.0  # of the largest and smallest singular value of the centred positions
 
 
 @kernel
@@ -118,8 +120,9 @@ def _levenberg_marquardt(
     total = _residuals(position, distance, use, r, JJ, x)
     for _ in range(_STEPS):
         copy(JJ, A)
-        for a in range(3):
-            A[a, a] += damping * (A[a, a] + 1e-9)
+        added = damping * (JJ[0, 0] + JJ[1, 1] + JJ[2, 2] + 1e-9)  # alike in all directions: fewer than three
+        for a in range(3):  # ranges leave some free, in which the step must not grow
+            A[a, a] += added
         if not _solve(A, x):
             break
         length = 0.0
@@ -139,6 +142,25 @@ def _levenberg_marquardt(
 
 
 @kernel
+def nearest_point(position: Array, distance: Array, use: Array, r: Array, scratch: Array) -> None:
+    """Move r (3,) to where it fits ranges from any number of vehicles: down the slope from r.
+
+    From four vehicles on that are not nearly in one plane, from their linear solution instead. A row of
+    `position` (m, 3) and `distance` (m,) counts where use (m,) is not 0; scratch (>= NEAREST_SCRATCH,).
+    """
+    centre, trial, x = scratch[:3], scratch[3:6], scratch[6:9].reshape(3, 1)
+    C, JJ = scratch[9:18].reshape(3, 3), scratch[18:27].reshape(3, 3)
+    count = 0
+    for j in range(use.shape[0]):
+        count += 1 if use[j] != 0.0 else 0
+    if count >= MIN_RANGES:
+        _spread(position, use, centre, C)
+        if _ratio_squared(C) <= MAX_RATIO * MAX_RATIO:
+            _linear_start(position, distance, use, centre, C, x, r)
+    _levenberg_marquardt(position, distance, use, r, trial, x, JJ, C)
+
+
+@kernel
 def _no_fix(reason: int, r: Array, P: Array) -> tuple[int, float, float]:
     for a in range(3):
         r[a] = 0.0
@@ -152,7 +174,7 @@ def _select(position: Array, distance: Array, valid: BoolArray, use: Array) -> i
     """Marks the ranges that count in use (m,), and returns how many do."""
     count = 0
     for j in range(use.shape[0]):
-        good = valid[j] and abs(distance[j]) < _LARGEST
+        good = valid[j] and 0.0 < distance[j] < _LARGEST
         for a in range(3):
             good = good and abs(position[j, a]) < _LARGEST
         use[j] = 1.0 if good else 0.0

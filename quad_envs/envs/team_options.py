@@ -275,6 +275,7 @@ class TargetTrackingOptions(TeamOptions):
             if name != "prior_velocity" and min(values) < (0.0 if name == "target_spread" else 1e-9):
                 raise ValueError(f"{name} must be positive standard deviations, got {getattr(self, name)!r}")
             object.__setattr__(self, name, values)
+        self._warn_of_narrow_prior()
         sensor_rows(self.sensor)
         make_target(self.target)
         TeamOptions.__post_init__(self)
@@ -293,6 +294,19 @@ class TargetTrackingOptions(TeamOptions):
             slots = slots + np.array(_BEHIND)
             slots[:, 2] += _STAGGER * (-1.0) ** np.arange(self.vehicles)
         return slots
+
+    def _warn_of_narrow_prior(self) -> None:
+        """Say if targets start farther from where they are expected than filters are told."""
+        for what, unit, true, told in zip(
+            ("position", "velocity"), ("m", "m/s"), self.target_spread, self.prior_sigma, strict=True
+        ):
+            if true > told:
+                warnings.warn(
+                    f"the target's {what} spreads by {true:g} {unit} (target_spread), and the prior of every "
+                    f"filter says {told:g} {unit} (prior_sigma): filters begin too sure of a wrong place; "
+                    "raise prior_sigma to at least target_spread",
+                    stacklevel=2,
+                )
 
     def informed(self) -> list[int]:
         """Vehicles that measure the target."""
