@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
+from .authority import hover_authority
 from .names import unknown_name
-from .parameters import Array
+from .parameters import Array, Limits, QuadrotorParams
 
 _Vector = tuple[float, float, float]
 _ZERO: _Vector = (0.0, 0.0, 0.0)
@@ -22,7 +23,11 @@ _ZERO: _Vector = (0.0, 0.0, 0.0)
 
 @runtime_checkable
 class Disturbance(Protocol):
-    """What an environment needs of a disturbance."""
+    """What an environment needs of a disturbance.
+
+    One that also has `size()`, (6,), its standard deviation where it is random and else its peak, is compared
+    with what the vehicle can hold. An impulse is over before a rotor can answer, and has none.
+    """
 
     @property
     def random(self) -> bool:
@@ -60,6 +65,13 @@ class TorquePulse:
         if not self.start < self.stop:
             raise ValueError(f"a pulse needs start < stop, got {self.start!r} and {self.stop!r} s")
 
+    def size(self) -> Array:
+        """Largest value of each component, (6,)."""
+        peak = abs(self.amplitude)
+        if self.clock == "absolute":
+            peak *= max(math.exp(-self.decay * time) for time in (self.start, self.stop))
+        return np.array([peak, peak, 0.0, 0.0, 0.0, 0.0])
+
     def values(self, t: Array, rng: np.random.Generator) -> Array:
         """Torque and force at the nodes, (n_steps, n_nodes, 6); a step is inside or outside as a whole."""
         a = t - self.start if self.clock == "relative" else t
@@ -80,38 +92,77 @@ class Steady:
     torque: _Vector = _ZERO  # N m, body
     random: ClassVar[bool] = False
 
+    def size(self) -> Array:
+        """Size of each component, (6,)."""
+        return np.abs(np.array([*self.torque, *self.force], dtype=np.float64))
+
     def values(self, t: Array, rng: np.random.Generator) -> Array:
         """Torque and force at the nodes, (n_steps, n_nodes, 6)."""
         return np.broadcast_to(np.array([*self.torque, *self.force]), (*t.shape, 6)).copy()
+
+
+# Gusts that are not given in numbers: shares of what the vehicle holds in hover, `hover_authority`.
+_TORQUE_SHARES = np.array(
+    [0.03, 0.03, 0.1]
+)  # roll, pitch, yaw: yaw is weak, and propellers turn with the wind
+_FORCE_SHARE = 0.25  # and not above
+_FORCE_OF_WEIGHT = 1.0 / 16.0  # 0.49 N of the default vehicle
 
 
 @dataclass(frozen=True, slots=True)
 class Gusts:
     """Force and torque as first-order Gauss-Markov processes: turbulence with a correlation time.
 
+    What is None follows the vehicle: a force of 1/16 of its weight (at most a quarter of what it can hold)
+    and torques of 3, 3 and 10 % of what its rotors can hold about roll, pitch and yaw in hover. That is
+    0.49 N and (0.019, 0.019, 0.0017) N m for the default vehicle.
+
     Raises:
         ValueError: If a deviation is negative or the correlation time is not positive.
     """
 
-    force: float = 0.5  # N, standard deviation of each inertial component
-    torque: float = 0.02  # N m, standard deviation of each body component
+    force: float | _Vector | None = None  # N, standard deviation of the inertial components
+    torque: float | _Vector | None = None  # N m, standard deviation of the body components
     correlation_time: float = 1.0  # s
     random: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        if self.force < 0.0 or self.torque < 0.0:
-            raise ValueError(
-                f"gust deviations must be >= 0, got force {self.force!r} N, torque {self.torque!r} N m"
-            )
+        for name, unit in (("force", "N"), ("torque", "N m")):
+            value = getattr(self, name)
+            size = np.asarray(0.0 if value is None else value, dtype=np.float64)
+            if size.shape not in ((), (3,)) or not (np.isfinite(size).all() and (size >= 0.0).all()):
+                raise ValueError(
+                    f"{name} of gusts must be None, one standard deviation >= 0 or three of them, {unit}, "
+                    f"got {value!r}"
+                )
         if not self.correlation_time > 0.0:
             raise ValueError(f"correlation_time must be > 0 s, got {self.correlation_time!r}")
+
+    def for_vehicle(self, params: QuadrotorParams, limits: Limits) -> Gusts:
+        """These gusts with the deviations that are None in numbers of a vehicle."""
+        authority = hover_authority(params, limits)
+        force = min(_FORCE_OF_WEIGHT * params.weight, _FORCE_SHARE * float(authority[3:].min()))
+        x, y, z = (_TORQUE_SHARES * authority[:3]).tolist()
+        return replace(
+            self,
+            force=force if self.force is None else self.force,
+            torque=(x, y, z) if self.torque is None else self.torque,
+        )
+
+    def size(self) -> Array:
+        """Standard deviation of each component, (6,)."""
+        known = self
+        if self.force is None or self.torque is None:
+            known = self.for_vehicle(QuadrotorParams(), Limits())
+        parts = (np.asarray(value, dtype=np.float64) for value in (known.torque, known.force))
+        return np.concatenate([np.broadcast_to(part, 3) for part in parts])
 
     def values(self, t: Array, rng: np.random.Generator) -> Array:
         """Torque and force at the nodes, (n_steps, n_nodes, 6), continuous from step to step."""
         steps, nodes = t.shape
         times = np.append(t[:, :-1].ravel(), t[-1, -1])
         keep = math.exp(-float(times[1] - times[0]) / self.correlation_time)
-        white = rng.standard_normal((times.size, 6)) * np.repeat([self.torque, self.force], 3)
+        white = rng.standard_normal((times.size, 6)) * self.size()
         white[1:] *= math.sqrt(1.0 - keep * keep)
         for i in range(1, times.size):
             white[i] += keep * white[i - 1]
@@ -160,3 +211,34 @@ def make_disturbance(what: str | Disturbance | None) -> Disturbance | None:
     if isinstance(what, str):
         raise ValueError(unknown_name("disturbance", what, ["none", *_BY_NAME]))
     raise ValueError(f"disturbance must be None, a name or a Disturbance, got {what!r}")
+
+
+def disturbance_of(
+    what: str | Disturbance | None, params: QuadrotorParams, limits: Limits
+) -> Disturbance | None:
+    """`make_disturbance` for a vehicle: with the deviations that follow from it."""
+    made = make_disturbance(what)
+    if isinstance(made, Gusts):
+        return made.for_vehicle(params, limits)
+    return made
+
+
+_COMPONENTS = (*(f"torque about body {axis}" for axis in "xyz"), *(f"force along {axis}" for axis in "xyz"))
+
+
+def beyond_authority(disturbance: Disturbance | None, params: QuadrotorParams, limits: Limits) -> str:
+    """What a person should know of a disturbance that no policy can hold; empty where there is nothing."""
+    size = getattr(disturbance, "size", None)
+    if size is None:
+        return ""
+    found, authority = np.asarray(size(), dtype=np.float64), hover_authority(params, limits)
+    excess = found / authority
+    worst = int(np.argmax(excess))
+    if not excess[worst] > 1.0:
+        return ""
+    unit, kind = "N m" if worst < 3 else "N", "1 sigma" if disturbance and disturbance.random else "peak"
+    return (
+        f"the disturbance's {_COMPONENTS[worst]}, {found[worst]:.3g} {unit} ({kind}), exceeds the "
+        f"{authority[worst]:.3g} {unit} that the vehicle can hold in hover: no policy can fly it for long; "
+        "lower it (disturbance='gusts' has sizes that follow from the vehicle)"
+    )

@@ -36,6 +36,7 @@ FORCES = slice(12, 16)  # rotor forces, appended to the state in plant rows
     HOVER_FORCE,  # u_T, N
 ) = range(14)
 N_COEFFICIENTS = 14
+MOST_KAPPA = 20.0  # thrust-to-weight 80, beyond any vehicle; the dissertation has 1
 
 
 def _require_positive(name: str, value: float, unit: str) -> None:
@@ -140,10 +141,11 @@ class Limits:
     position_upper: tuple[float, float, float] = (math.inf, math.inf, math.inf)  # m, NED
 
     def __post_init__(self) -> None:
-        if not 0.25 < self.kappa <= 1.0:
+        if not 0.25 < self.kappa <= MOST_KAPPA:
             raise ValueError(
-                f"kappa must lie in (1/4, 1] so that hover is feasible, got {self.kappa!r}; "
-                "0.3125 gives the dissertation's 2.45 N"
+                "kappa, the largest rotor force as a fraction of the weight, must lie in "
+                f"(1/4, {MOST_KAPPA:g}], above 1/4 so that hover is feasible, got {self.kappa!r}; "
+                "it is a quarter of the thrust-to-weight ratio; 0.3125 gives the dissertation's 2.45 N"
             )
         for name, unit in (("rate", "N/s"), ("tilt", "rad"), ("velocity", "m/s")):
             value = getattr(self, name)

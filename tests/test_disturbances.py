@@ -3,7 +3,18 @@
 import numpy as np
 import pytest
 
-from quad_envs.disturbances import Gusts, Impulse, Steady, TorquePulse, make_disturbance
+from quad_envs.authority import hover_authority
+from quad_envs.disturbances import (
+    Gusts,
+    Impulse,
+    Steady,
+    TorquePulse,
+    beyond_authority,
+    disturbance_of,
+    make_disturbance,
+)
+from quad_envs.envs.tracking import TrackingEnv
+from quad_envs.parameters import Limits, QuadrotorParams
 
 DT, NODES = 0.05, 11
 TIMES = DT * (np.arange(240)[:, None] + np.linspace(0, 1, NODES))
@@ -61,9 +72,71 @@ def test_every_name_makes_a_disturbance(name):
         lambda: TorquePulse(clock="x"),
         lambda: TorquePulse(start=3, stop=2),
         lambda: Gusts(force=-1.0),
+        lambda: Gusts(torque=(0.01, 0.01)),
+        lambda: Gusts(torque=(0.01, 0.01, float("nan"))),
         lambda: Gusts(correlation_time=0.0),
     ],
 )
 def test_a_bad_disturbance_is_refused(make):
-    with pytest.raises(ValueError, match=r"disturbance|clock|start|deviations|correlation"):
+    with pytest.raises(ValueError, match=r"disturbance|clock|start|deviation|correlation"):
         make()
+
+
+VEHICLES = {
+    "default": (QuadrotorParams(), Limits()),
+    "weak": (QuadrotorParams(), Limits(kappa=0.3125, tilt=0.35)),
+    "light": (
+        QuadrotorParams(mass=0.03, inertia=(2e-5, 2e-5, 3e-5), arm=0.05, yaw_moment=0.006),
+        Limits(0.5),
+    ),
+}
+
+
+@pytest.mark.parametrize(("params", "limits"), VEHICLES.values(), ids=VEHICLES)
+def test_the_authority_is_where_the_first_rotor_in_equilibrium_meets_its_limit(params, limits):
+    found = hover_authority(params, limits)
+    top, inverse = limits.kappa * params.weight, np.linalg.inv(params.mixer())
+    for i, torque in enumerate(found[:3]):
+        for sign in (1.0, -1.0):
+            demand = np.zeros(4)
+            demand[0], demand[1 + i] = params.weight, sign * torque
+            F = inverse @ demand
+            assert F.min() >= -1e-12 and F.max() <= top + 1e-12
+        assert min(F.min(), top - F.max()) == pytest.approx(0.0, abs=1e-12)
+    thrust = params.weight + found[5]
+    assert thrust == pytest.approx(min(2.0 * params.weight, 4.0 * top))
+    if np.isfinite(limits.tilt):
+        assert found[3] == pytest.approx(params.weight * np.tan(limits.tilt))
+    else:
+        assert np.hypot(found[3], params.weight) == pytest.approx(thrust)
+
+
+@pytest.mark.parametrize(("params", "limits"), VEHICLES.values(), ids=VEHICLES)
+def test_gusts_without_numbers_are_within_what_the_vehicle_holds(params, limits):
+    share = disturbance_of("gusts", params, limits).size() / hover_authority(params, limits)
+    # the share of yaw is 10 %, of each force at most 25 %: four standard deviations are within the authority
+    assert share[2] <= 0.1 + 1e-12 and (share <= 0.25 + 1e-12).all() and (share > 0.0).all()
+    assert beyond_authority(disturbance_of("gusts", params, limits), params, limits) == ""
+
+
+def test_gusts_in_numbers_keep_them():
+    gusts = disturbance_of(Gusts(force=0.2, torque=(0.01, 0.02, 0.001)), *VEHICLES["light"])
+    np.testing.assert_array_equal(gusts.size(), [0.01, 0.02, 0.001, 0.2, 0.2, 0.2])
+
+
+@pytest.mark.parametrize(
+    ("disturbance", "words"),
+    [
+        (Gusts(torque=0.02), r"torque about body z, 0\.02 N m \(1 sigma\), exceeds the 0\.017 N m"),
+        (Steady(force=(0.0, 0.0, -9.0)), r"force along z, 9 N \(peak\), exceeds the 7\.84 N"),
+        (TorquePulse(clock="relative"), r"torque about body x, 1 N m \(peak\), exceeds the 0\.647 N m"),
+    ],
+)
+def test_an_environment_warns_of_a_disturbance_beyond_the_authority_with_both_numbers(disturbance, words):
+    with pytest.warns(UserWarning, match=words):
+        TrackingEnv(disturbance=disturbance)
+
+
+@pytest.mark.parametrize("disturbance", [TorquePulse(), Impulse(), Steady(), "gusts", None])
+def test_shipped_disturbances_are_within_the_authority_of_the_default_vehicle(disturbance):
+    TrackingEnv(disturbance=disturbance)  # a warning is an error in these tests

@@ -8,9 +8,9 @@ import pytest
 from quad_envs.parameters import Limits, QuadrotorParams, Weights
 
 
-@pytest.mark.parametrize("kappa", [0.25, 0.0, -1.0, 1.01, math.nan])
-def test_kappa_outside_a_quarter_to_one_is_refused(kappa):
-    with pytest.raises(ValueError, match=r"kappa must lie in \(1/4, 1\]"):
+@pytest.mark.parametrize("kappa", [0.25, 0.0, -1.0, 20.1, math.nan, math.inf])
+def test_kappa_outside_a_quarter_to_twenty_is_refused(kappa):
+    with pytest.raises(ValueError, match=r"kappa, .* must lie in \(1/4, 20\]"):
         Limits(kappa=kappa)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._numba import entry_of
-from ..disturbances import Disturbance, make_disturbance
+from ..disturbances import Disturbance
 from ..observations import N_REFERENCE
 from ..parameters import N_STATE, POSITION, Array
 from ..references import Reference, make_reference
@@ -44,7 +44,7 @@ class TrackingBatch:
         self.rows: Array = np.zeros((n, ROW_SIZE))
         self._vector = task_vector(self.task, options.substeps, options.lost_distance)
         self._reference: Reference = make_reference(options.reference)
-        self._disturbance: Disturbance | None = make_disturbance(options.disturbance)
+        self._disturbance: Disturbance | None = options.make_disturbance()
         self._randomization = options.randomization()
         self._start, self._widths = options.start_state(), options.start_half_widths()
         steps, dt = self.task.episode_steps, self.task.dt

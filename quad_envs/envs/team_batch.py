@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from .._numba import entry_of
 from ..constraints import constraint_scales
-from ..disturbances import make_disturbance
 from ..dynamics import LANES
 from ..formations import start_positions
 from ..graphs import in_neighbours
@@ -75,7 +74,7 @@ class TeamBatch:
         self._reference = make_reference(
             options.reference if isinstance(options, FormationOptions) else "setpoint"
         )
-        self._disturbance = make_disturbance(options.disturbance)
+        self._disturbance = options.make_disturbance()
         self._target = make_target(options.target) if isinstance(options, TargetTrackingOptions) else None
         self._spread = options.target_spread if isinstance(options, TargetTrackingOptions) else (0.0, 0.0)
         noisy = bool(self._noise.any())

@@ -60,7 +60,7 @@ class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     Vehicle: `mass` 0.8 kg, `gravity` 9.8 m/s^2, `inertia` (0.0224, 0.0224, 0.0436) kg m^2, `arm` 0.165 m,
     `yaw_moment`
         0.002167 m, `rotor_rate` 50 1/s, `drag` 0 kg/s.
-    Limits: `kappa` 1 (largest rotor force as a fraction of the weight, in (1/4, 1]), `rate_limit` N/s per
+    Limits: `kappa` 1 (largest rotor force as a fraction of the weight, in (1/4, 20]), `rate_limit` N/s per
     rotor,
         `tilt_limit` rad on |roll| and |pitch|, `velocity_limit` m/s on each body velocity, `position_limit`
         ((x, y, z) lower, (x, y, z) upper) m. No limit but kappa by default.

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
-from ..disturbances import Disturbance, make_disturbance
+from ..disturbances import Disturbance, beyond_authority, disturbance_of
 from ..names import suggestion
 from ..parameters import N_STATE, Limits, QuadrotorParams, Weights
 
@@ -87,7 +88,9 @@ class VehicleOptions:
         self.make_limits()
         self.randomization()
         self.noise_deviations()
-        make_disturbance(self.disturbance)
+        excess = beyond_authority(self.make_disturbance(), self.make_params(), self.make_limits())
+        if excess:
+            warnings.warn(excess, stacklevel=2)
 
     def require_positive(self, name: str) -> None:
         """Check that a field is a finite number > 0.
@@ -143,9 +146,9 @@ class VehicleOptions:
             position_upper=upper,
         )
 
-    def task_fields(self) -> dict[str, Any]:
-        """What each kind of Task has of these options."""
-        params = QuadrotorParams(
+    def make_params(self) -> QuadrotorParams:
+        """The nominal vehicle."""
+        return QuadrotorParams(
             mass=self.mass,
             gravity=self.gravity,
             inertia=self.inertia,
@@ -154,9 +157,16 @@ class VehicleOptions:
             rotor_rate=self.rotor_rate,
             drag=self.drag,
         )
+
+    def make_disturbance(self) -> Disturbance | None:
+        """The disturbance; gusts without numbers follow the nominal vehicle."""
+        return disturbance_of(self.disturbance, self.make_params(), self.make_limits())
+
+    def task_fields(self) -> dict[str, Any]:
+        """What each kind of Task has of these options."""
         return {
             "env_id": self.env_id,
-            "params": params,
+            "params": self.make_params(),
             "limits": self.make_limits(),
             "weights": Weights(Q=spread("Q", self.Q, N_STATE), R=spread("R", self.R, 4)),
             "dt": self.dt,
