@@ -60,6 +60,7 @@ def plain_warnings() -> Iterator[None]:
 def list_names(options: ListOptions) -> int:
     """Print what there is, or the options of one environment or policy."""
     from quad_envs.registration import TRACKING
+    from quad_envs.vehicles import VEHICLES
 
     from .policy import TEAM_POLICIES, TRACKING_POLICIES
     from .suite_files import suite_names
@@ -72,8 +73,12 @@ def list_names(options: ListOptions) -> int:
         name: f"{entry.description}; for {', '.join(entry.missions)}{' (privileged)' * entry.privileged}"
         for name, entry in TEAM_POLICIES.items()
     }
+    vehicles = {
+        name: f"{vehicle.about}, thrust-to-weight {vehicle.thrust_to_weight:.2g} ({vehicle.source})"
+        for name, vehicle in VEHICLES.items()
+    }
     if options.json:
-        found = {"environments": TRACKING, "team_environments": TEAM_KINDS}
+        found = {"environments": TRACKING, "team_environments": TEAM_KINDS, "vehicles": vehicles}
         print(
             json.dumps(
                 found
@@ -94,6 +99,7 @@ def list_names(options: ListOptions) -> int:
     for title, entries in (
         ("environments of one vehicle (Gymnasium)", envs),
         ("environments of several vehicles (PettingZoo)", TEAM_KINDS),
+        ("vehicles: --set vehicle=NAME", vehicles),
         ("policies for one vehicle", policies),
         ("policies for several vehicles", team),
         ("trained policies", shipped_policies() or {"-": "none; quad-envs train ENV ALGORITHM makes one"}),

@@ -100,7 +100,7 @@ class CooperativePolicy(TeamPolicy):
             state.fallbacks,
             state.worst_iterations,
             float(task.hover_force),
-            float(task.force_max),
+            task.force_max,
             float(task.dt),
             decision.memory,
             filters,

@@ -137,7 +137,7 @@ def encode_decisions(
     counts: Counts,
     worst: Counts,
     hover: float,
-    force_max: float,
+    force_max: Array,
     dt: float,
     first: Array,
     second: Array,
@@ -157,7 +157,7 @@ def encode_decisions(
         counts: Statistics so far, (n, 5).
         worst: Statistics so far, (n,).
         hover: Force of action 0, N.
-        force_max: Force of action 1, N.
+        force_max: Force of action 1 of each rotor, (4,), N.
         dt: Control period, s.
         first: Part of the memory, (n, a).
         second: The other one, (n, b).

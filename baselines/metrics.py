@@ -161,7 +161,7 @@ def _settling_time(error: Array, dt: float) -> float:
     return last * dt if last < len(error) - 1 else float("nan")
 
 
-def _saturation_share(commands: Array, force_max: float) -> float:
+def _saturation_share(commands: Array, force_max: Array) -> float:
     if np.isnan(commands).any():  # actions that command no rotors
         return float("nan")
     return float(((commands <= SATURATED) | (commands >= force_max - SATURATED)).mean())

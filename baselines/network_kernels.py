@@ -23,7 +23,7 @@ def forward_rows(
     sizes: Ints,
     weights: Floats,
     tanh_last: bool,
-    gain: np.float32,
+    gain: Floats,
     work: Floats,
     out: Floats,
 ) -> int:
@@ -35,7 +35,7 @@ def forward_rows(
         sizes: Inputs and outputs of each layer, (layers + 1,).
         weights: Row by row the weights of a layer, then its biases, layer after layer.
         tanh_last: Whether the outputs pass a tanh, too, before they are clipped to [-1, 1].
-        gain: By which positive outputs of the first four are scaled, see `networks.hover_actions`.
+        gain: By which positive outputs of the first four are scaled, (4,), see `networks.hover_actions`.
         work: Scratch, (2, max(sizes)).
         out: Result, (n, sizes[-1]).
 
@@ -65,6 +65,6 @@ def forward_rows(
         for j in range(sizes[layers]):
             value = min(max(work[layers % 2, j], np.float32(-1.0)), np.float32(1.0))
             if j < 4 and value > 0.0:
-                value = min(value * gain, np.float32(1.0))
+                value = min(value * gain[j], np.float32(1.0))
             out[r, j] = value
     return -1

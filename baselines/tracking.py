@@ -84,7 +84,7 @@ def encode_commands(
     counts: Counts,
     worst: Counts,
     hover: float,
-    force_max: float,
+    force_max: Array,
     actions: Actions,
     new_counts: Counts,
     new_worst: Counts,
@@ -99,14 +99,14 @@ def encode_commands(
         counts: Statistics so far, (n, 5).
         worst: Statistics so far, (n,).
         hover: Force of action 0, N.
-        force_max: Force of action 1, N.
+        force_max: Force of action 1 of each rotor, (4,), N.
         actions: Output, (n, 4) float32.
         new_counts: Output, (n, 5).
         new_worst: Output, (n,).
     """
     for j in range(commands.shape[0]):
         for i in range(4):
-            actions[j, i] = action_from_force(commands[j, i], hover, force_max)
+            actions[j, i] = action_from_force(commands[j, i], hover, force_max[i])
         for i in range(N_FALLBACKS):
             new_counts[j, i] = 0 if start[j] else counts[j, i]
         new_counts[j, fallback[j]] += 1
@@ -125,7 +125,7 @@ class ControllerPolicy:
     def __init__(self, controller: Controller, task: Task, name: str) -> None:
         self.controller, self.task, self.name = controller, task, name
         self._size, self._stages = task.layout.size, controller.horizon + 1
-        self._hover, self._force_max = float(task.hover_force), float(task.force_max)
+        self._hover, self._force_max = float(task.hover_force), task.force_max
         self._sees = bool(task.layout.position), bool(task.layout.disturbance)
 
     def __repr__(self) -> str:
@@ -215,7 +215,7 @@ class Random:
 
     def __init__(self, task: Task, seed: int = 0) -> None:
         require_whole("seed", seed, 0)
-        self._seed, self._hover, self._force_max = int(seed), float(task.hover_force), float(task.force_max)
+        self._seed, self._hover, self._force_max = int(seed), float(task.hover_force), task.force_max
 
     def decide(
         self,

@@ -110,7 +110,7 @@ def _build(task: Task, N: int) -> tuple[Any, dict[str, Array]]:
     still = np.zeros(N_STATE * (N + 1))
     bounds = {
         "lbx": np.r_[-free, np.full(N_INPUT * N, -task.hover_force)],
-        "ubx": np.r_[free, np.full(N_INPUT * N, task.force_max - task.hover_force)],
+        "ubx": np.r_[free, np.tile(task.force_max - task.hover_force, N)],
         "lbg": np.r_[still, -change],
         "ubg": np.r_[still, change],
     }

@@ -249,7 +249,7 @@ class CentralMpc:
             np.zeros((2 * size + 2 * n * K + P + slack, size + slack)),
         )
         lower, upper = np.full(len(A), -math.inf), np.full(len(A), math.inf)
-        lower[:size], upper[:size] = -hover, data.force_max - hover
+        lower[:size], upper[:size] = -hover, np.tile(data.force_max - hover, n * N)
         A[:size, :size] = np.eye(size)
         limits, pairs = 2 * size, 2 * size + 2 * n * K
         normals = data.normals[data.normal]

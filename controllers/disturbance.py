@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 from quad_envs._numba import kernel
-from quad_envs.dynamics import SCRATCH_ROWS, advance, load_vehicle, store_vehicle
+from quad_envs.dynamics import SCRATCH_ROWS, advance, load_vehicle, rotor_shares, store_vehicle
 from quad_envs.parameters import (
     GRAVITY,
     HOVER_FORCE,
@@ -19,7 +19,7 @@ from quad_envs.parameters import (
     INV_JZ,
     INV_MASS,
     N_INPUT,
-    PITCH_GAIN,
+    ROLL_CROSS,
     ROLL_GAIN,
     YAW_GAIN,
     Array,
@@ -45,7 +45,7 @@ _YAW_SHARE = 0.5  # of the rotor force range around hover that may go into cance
 
 
 @kernel
-def feed_forward(d: Array, psi: float, c: Array, force_max: float, offset: Array, trim: Array) -> None:
+def feed_forward(d: Array, psi: float, c: Array, force_max: Array, offset: Array, trim: Array) -> None:
     """Rotor forces and attitude at which the vehicle stands still under a constant disturbance.
 
     With f = d_force / m in axes turned by psi, thrust and attitude satisfy T/m R_BI'e3 = g e3 + f. The yaw
@@ -56,7 +56,7 @@ def feed_forward(d: Array, psi: float, c: Array, force_max: float, offset: Array
         d: Disturbance, (6,).
         psi: Yaw, rad.
         c: QuadrotorParams.coefficients().
-        force_max: Largest rotor force, N.
+        force_max: Largest force of each rotor, (4,), N.
         offset: Result, rotor forces in equilibrium, (4,), N: u_T without disturbance. May leave the box.
         trim: Result, state in equilibrium, (12,): zero but for roll and pitch, rad.
     """
@@ -72,14 +72,14 @@ def feed_forward(d: Array, psi: float, c: Array, force_max: float, offset: Array
         offset[:] = hover * specific / c[GRAVITY]
         trim[6] = -math.asin(side / specific)
         trim[7] = math.atan(forward / down)
-    roll = 0.5 * d[0] * c[INV_JX] / c[ROLL_GAIN]
-    pitch = 0.5 * d[1] * c[INV_JY] / c[PITCH_GAIN]
-    share = _YAW_SHARE * min(hover, force_max - hover)
-    yaw = min(max(0.25 * d[2] * c[INV_JZ] / c[YAW_GAIN], -share), share)
-    offset[0] += yaw - pitch
-    offset[1] += roll - yaw
-    offset[2] += pitch + yaw
-    offset[3] -= roll + yaw
+    share = _YAW_SHARE * hover
+    for i in range(N_INPUT):
+        share = min(share, _YAW_SHARE * (force_max[i] - hover))
+    most = 4.0 * share * c[YAW_GAIN]
+    yaw = min(max(d[2] * c[INV_JZ], -most), most)
+    shares = rotor_shares(d[0] * c[INV_JX], d[1] * c[INV_JY], yaw, c)
+    for i in range(N_INPUT):
+        offset[i] -= shares[i]
 
 
 @kernel
@@ -112,7 +112,7 @@ def update_estimate(
     gain: float,
     c: Array,
     dt: float,
-    force_max: float,
+    force_max: Array,
     estimate: Array,
     scratch: Array,
     which: IntArray,
@@ -131,7 +131,7 @@ def update_estimate(
         gain: Share of each correction, in (0, 1].
         c: QuadrotorParams.coefficients().
         dt: Control period, s.
-        force_max: Largest rotor force, N.
+        force_max: Largest force of each rotor, (4,), N.
         estimate: Result, (6,).
         scratch: Overwritten, (ESTIMATOR_SCRATCH,).
         which: Zeros, (1,).
@@ -155,7 +155,7 @@ def update_estimate(
     if not (store_vehicle(w, 0, 1, predicted) and _residual(plant, predicted, dt, c, correction)):
         return
     weight = 4.0 * c[HOVER_FORCE]
-    arm = c[ROLL_GAIN] / c[INV_JX]
+    arm = math.hypot(c[ROLL_GAIN], c[ROLL_CROSS]) / c[INV_JX]
     for i in range(N_DISTURBANCE):
         limit = _FORCE_SHARE * weight if i >= 3 else _TORQUE_SHARE * 0.5 * arm * weight
         estimate[i] = min(max(estimate[i] + gain * correction[i], -limit), limit)

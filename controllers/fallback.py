@@ -27,17 +27,17 @@ RELAXED_WEIGHT = 1e4  # exact penalty per unit of a row that was hard
 
 
 @kernel
-def limit_command(F: Array, last: Array, rate_step: float, force_max: float, out: Array) -> None:
+def limit_command(F: Array, last: Array, rate_step: float, force_max: Array, out: Array) -> None:
     """Bring a command to within one rate step of the last one where the box allows it, always into the box.
 
     Args:
         F: Wanted rotor commands, (4,), N; an entry that is not finite becomes the last command.
         last: Last applied commands, (4,), N.
         rate_step: Largest change, N; inf for none.
-        force_max: Upper face of the box, N.
+        force_max: Upper face of the box, (4,), N.
         out: Result, (4,).
     """
     for a in range(N_INPUT):
         value = F[a] if abs(F[a]) < 1e300 else last[a]
         value = min(max(value, last[a] - rate_step), last[a] + rate_step)
-        out[a] = min(max(value, 0.0), force_max)
+        out[a] = min(max(value, 0.0), force_max[a])

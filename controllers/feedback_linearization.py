@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from quad_envs._numba import kernel
+from quad_envs.dynamics import rotor_shares
 from quad_envs.parameters import (
     GRAVITY,
     GYRO_X,
@@ -18,9 +19,6 @@ from quad_envs.parameters import (
     INV_JZ,
     INV_MASS,
     N_INPUT,
-    PITCH_GAIN,
-    ROLL_GAIN,
-    YAW_GAIN,
     Array,
 )
 from quad_envs.rotations import sincos, wrap_angle_scalar
@@ -80,15 +78,9 @@ def _rotor_forces(
     alpha_y = -c[GYRO_Y] * p * r - gains[KA] * (theta - theta_d) - gains[KAD] * q - c[INV_JY] * d[1]
     alpha_z = -c[GYRO_Z] * p * q - _YAW_STIFFNESS * yaw_error - _YAW_DAMPING * r - c[INV_JZ] * d[2]
     lift_part = 0.25 * specific / c[INV_MASS]
-    roll, pitch, yaw = (
-        0.5 * alpha_x / c[ROLL_GAIN],
-        0.5 * alpha_y / c[PITCH_GAIN],
-        0.25 * alpha_z / c[YAW_GAIN],
-    )
-    F[0] = lift_part + pitch - yaw
-    F[1] = lift_part - roll + yaw
-    F[2] = lift_part - pitch - yaw
-    F[3] = lift_part + roll + yaw
+    shares = rotor_shares(alpha_x, alpha_y, alpha_z, c)
+    for i in range(N_INPUT):
+        F[i] = lift_part + shares[i]
 
 
 @kernel
@@ -105,7 +97,7 @@ def _decide_rows(
     c: Array,
     heading: bool,
     dt: float,
-    force_max: float,
+    force_max: Array,
     rate_step: float,
     scratch: Array,
 ) -> int:
@@ -172,7 +164,7 @@ class FeedbackLinearization(FeedbackLaw):
             task.params.coefficients(),
             frame == "heading",
             float(task.dt),
-            float(task.force_max),
+            task.force_max,
             float(task.limits.rate * task.dt),
         )
         self._scratch = np.empty((2, N_INPUT))

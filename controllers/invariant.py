@@ -73,7 +73,7 @@ def law_halfspaces(task: BaseTask, K: ArrayLike, A_K: ArrayLike, margin: float =
     K, A_K = np.asarray(K, dtype=np.float64), np.asarray(A_K, dtype=np.float64)
     u_T = task.hover_force
     normals, names = [K], [f"rotor {i + 1}" for i in range(N_INPUT)]
-    bounds = [np.full(N_INPUT, min(u_T, task.force_max - u_T))]
+    bounds = [np.minimum(u_T, task.force_max - u_T)]
     if math.isfinite(task.limits.rate):
         normals.append(K @ (A_K - np.eye(len(A_K))))
         bounds.append(np.full(N_INPUT, task.limits.rate * task.dt))

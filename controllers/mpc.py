@@ -125,7 +125,7 @@ def mpc_data(task: BaseTask, horizon: int, options: MpcOptions) -> MpcData:
         upper=rows.upper.copy(),
         weight=rows.weight.copy(),
         dt=float(task.dt),
-        force_max=float(task.force_max),
+        force_max=task.force_max,
         rate_step=float(task.limits.rate * task.dt),
         gain=float(options.estimator_gain) if options.reject_disturbance else 0.0,
         heading=options.frame == "heading",

@@ -40,7 +40,7 @@ class MpcData(NamedTuple):
     upper: Array  # (K,)
     weight: Array  # (K,)
     dt: float
-    force_max: float
+    force_max: Array  # (4,), N
     rate_step: float
     gain: float  # of the disturbance estimator, 0 for none
     heading: bool  # whether the problem is posed at the present position and heading
@@ -251,7 +251,7 @@ def begin_row(
     set_references(plant, window, s.trim, data.heading, data.attitude, s.r)
     for a in range(N_INPUT):
         s.lower[a] = -s.offset[a]
-        s.upper[a] = data.force_max - s.offset[a]
+        s.upper[a] = data.force_max[a] - s.offset[a]
         s.u_last[a] = last[a] - s.offset[a]
     copy(data.normals, s.normals)
     copy_vector(data.lower, s.row_lower)

@@ -71,7 +71,7 @@ def _decide_rows(
     R: Array,
     K_0: Array,
     dt: float,
-    force_max: float,
+    force_max: Array,
     rate_step: float,
     scratch: Array,
 ) -> int:
@@ -152,7 +152,7 @@ class Sdre(FeedbackLaw):
             R,
             K,
             float(task.dt),
-            float(task.force_max),
+            task.force_max,
             float(task.limits.rate * task.dt),
         )
         self._scratch = np.empty((_MATRICES + 2, N_STATE, N_STATE))

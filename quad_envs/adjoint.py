@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ._numba import inline_kernel, kernel
-from .dynamics import rigid_body
+from .dynamics import rigid_body, rotor_limits
 from .parameters import (
     DRAG_RATE,
     GRAVITY,
@@ -23,7 +23,9 @@ from .parameters import (
     INV_MASS,
     N_INPUT,
     N_STATE,
+    PITCH_CROSS,
     PITCH_GAIN,
+    ROLL_CROSS,
     ROLL_GAIN,
     ROTOR_RATE,
     YAW_GAIN,
@@ -100,10 +102,12 @@ def rigid_body_vjp(x: Array, F: Array, d: Array, c: Array, bar: Array, bar_x: Ar
     bar_x[10] = b2 * u - b0 * w + kin * sf / ct + e1 * cf + g0 * c[GYRO_X] * r + g2 * c[GYRO_Z] * p
     bar_x[11] = b0 * v - b1 * u + kin * cf / ct - e1 * sf + g0 * c[GYRO_X] * q + g1 * c[GYRO_Y] * p
     thrust, yaw = -c[INV_MASS] * b2, c[YAW_GAIN] * g2
-    bar_F[0] = thrust + c[PITCH_GAIN] * g1 - yaw
-    bar_F[1] = thrust - c[ROLL_GAIN] * g0 + yaw
-    bar_F[2] = thrust - c[PITCH_GAIN] * g1 - yaw
-    bar_F[3] = thrust + c[ROLL_GAIN] * g0 + yaw
+    ahead = c[PITCH_GAIN] * g1 - c[ROLL_CROSS] * g0  # of rotor 1, opposite to rotor 3
+    left = c[ROLL_GAIN] * g0 + c[PITCH_CROSS] * g1  # of rotor 4, opposite to rotor 2
+    bar_F[0] = thrust + ahead - yaw
+    bar_F[1] = thrust - left + yaw
+    bar_F[2] = thrust - ahead - yaw
+    bar_F[3] = thrust + left + yaw
 
 
 @inline_kernel
@@ -115,10 +119,10 @@ def _derivative(x: Array, F: Array, d: Array, c: Array, out: Array) -> None:
 
 
 @inline_kernel
-def _lag(F: Array, command: Array, force_max: float, decay: float, out: Array) -> None:
+def _lag(F: Array, command: Array, force_max: Array, decay: float, out: Array) -> None:
     """Rotor forces after the decay, toward the saturated commands."""
     for i in range(N_INPUT):
-        target = min(max(command[i], 0.0), force_max)
+        target = min(max(command[i], 0.0), force_max[i])
         out[i] = target + (F[i] - target) * decay
 
 
@@ -127,7 +131,7 @@ def _stages(
     x: Array,
     F: Array,
     command: Array,
-    force_max: float,
+    force_max: Array,
     c: Array,
     h: float,
     d: Array,
@@ -187,7 +191,7 @@ def _substep_vjp(
 def step_vjp_kernel(
     plant: Array,
     command: Array,
-    force_max: float,
+    force_max: Array,
     c: Array,
     substeps: int,
     h: float,
@@ -201,7 +205,7 @@ def step_vjp_kernel(
     Args:
         plant: Before it, (16,).
         command: Rotor commands, (4,), N.
-        force_max: Largest rotor force, N.
+        force_max: Largest force of each rotor, (4,), N.
         c: QuadrotorParams.coefficients().
         substeps: RK4 steps, at most 64.
         h: Length of one, s.
@@ -229,7 +233,7 @@ def step_vjp_kernel(
         _stages(x[:N_STATE], x[N_STATE:], command, force_max, c, h, d, w, past[s + 1])
         _substep_vjp(h, half, c, d, w, bar_plant[:N_STATE], bar_plant[N_STATE:], bar_command)
     for i in range(N_INPUT):
-        if not 0.0 <= command[i] <= force_max:
+        if not 0.0 <= command[i] <= force_max[i]:
             bar_command[i] = 0.0
 
 
@@ -240,7 +244,7 @@ SCRATCH_ROWS = 14 + _MOST_SUBSTEPS + 1
 def _step_vjp_rows(
     plants: Array,
     commands: Array,
-    force_max: float,
+    force_max: Array,
     c: Array,
     substeps: int,
     h: float,
@@ -261,7 +265,7 @@ def step_vjp(
     bar: ArrayLike,
     params: QuadrotorParams,
     *,
-    force_max: float | None = None,
+    force_max: ArrayLike | None = None,
     duration: float = 0.05,
     substeps: int = 5,
 ) -> tuple[Array, Array]:
@@ -272,7 +276,7 @@ def step_vjp(
         command: Rotor commands, (..., 4), N; one outside the rotor box has no influence.
         bar: Sensitivity of a scalar to the plant after the period, (..., 16).
         params: The vehicle.
-        force_max: Upper saturation of the rotor forces, N; None for the weight (kappa = 1).
+        force_max: Upper saturation of the rotor forces, N: one number or (4,); None for the weight.
         duration: s.
         substeps: RK4 steps, 1 to 64.
 
@@ -294,7 +298,7 @@ def step_vjp(
     _step_vjp_rows(
         plants.reshape(-1, _PLANT),
         commands,
-        params.weight if force_max is None else float(force_max),
+        rotor_limits(force_max, params),
         params.coefficients(),
         substeps,
         duration / substeps,

@@ -19,8 +19,10 @@ def hover_authority(params: QuadrotorParams, limits: Limits) -> Array:
         Torque about each body axis, N m, then force along each inertial axis, N, (6,).
     """
     u_T = params.hover_force
-    room = min(u_T, limits.kappa * params.weight - u_T)
-    thrust, *torque = room / np.abs(np.linalg.inv(params.mixer())).max(axis=0)
+    room = np.minimum(u_T, np.array(limits.kappas) * params.weight - u_T)
+    shares = np.abs(np.linalg.inv(params.mixer()))
+    with np.errstate(divide="ignore"):  # a rotor without a share never meets its limit
+        thrust, *torque = (room[:, None] / shares).min(axis=0)
     lateral = math.sqrt((params.weight + thrust) ** 2 - params.weight**2)
     if math.isfinite(limits.tilt):
         lateral = min(lateral, params.weight * math.tan(limits.tilt))

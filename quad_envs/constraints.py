@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ._numba import inline_kernel, kernel
-from .parameters import Array, Limits
+from .parameters import N_INPUT, Array, Limits
 
 TOLERANCE = 1e-3  # SI: 1 mm, 1 mm/s, 1 mrad, 1 mN; below what a model without rotor lag can promise
 
@@ -84,28 +84,29 @@ def action_from_force(force: float, hover: float, force_max: float) -> float:
 
 
 @kernel
-def _actions_from_forces(forces: Array, hover: float, force_max: float, out: NDArray[np.float32]) -> None:
+def _actions_from_forces(forces: Array, hover: float, force_max: Array, out: NDArray[np.float32]) -> None:
     for i in range(forces.size):
-        out[i] = action_from_force(forces[i], hover, force_max)
+        out[i] = action_from_force(forces[i], hover, force_max[i % N_INPUT])
 
 
-def actions_from_forces(forces: Array, hover: float, force_max: float) -> NDArray[np.float32]:
+def actions_from_forces(forces: Array, hover: float, force_max: ArrayLike) -> NDArray[np.float32]:
     """Actions that command these rotor forces, the inverse of `forces_from_actions`.
 
     Args:
         forces: (..., 4), N, C-contiguous; forces outside [0, force_max] are clipped.
         hover: Force of action 0, N.
-        force_max: Force of action +1, N.
+        force_max: Force of action +1, N: one number or (4,), one per rotor.
 
     Returns:
         (..., 4), float32.
     """
     out = np.empty(forces.shape, dtype=np.float32)
-    _actions_from_forces(forces.reshape(-1), hover, force_max, out.reshape(-1))
+    most = np.array(np.broadcast_to(np.asarray(force_max, dtype=np.float64), N_INPUT))
+    _actions_from_forces(forces.reshape(-1), hover, most, out.reshape(-1))
     return out
 
 
-def forces_from_actions(actions: ArrayLike, hover: float, force_max: float) -> Array:
-    """Rotor commands of actions in [-1, 1], (..., 4), N."""
+def forces_from_actions(actions: ArrayLike, hover: float, force_max: ArrayLike) -> Array:
+    """Rotor commands of actions in [-1, 1], (..., 4), N; force_max is one number or one per rotor."""
     a = np.clip(np.asarray(actions, dtype=np.float64), -1.0, 1.0)
-    return np.asarray(hover + a * np.where(a < 0.0, hover, force_max - hover))
+    return np.asarray(hover + a * np.where(a < 0.0, hover, np.asarray(force_max, dtype=np.float64) - hover))

@@ -33,7 +33,6 @@ _MOST_MAGNIFIED = 8.0
 _ROTOR = 0.62  # radius of a rotor disc, relative to the arm
 _NUMBERED = 12  # vehicles up to which each shows its number
 DETAILED = 24  # and up to which each shows its rotor forces and a drop line with a scale
-_ARMS: Array = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def magnification(scene: Scene, canvas: Canvas) -> float:
@@ -166,11 +165,12 @@ def _vehicle_pixels(scene: Scene, canvas: Canvas, magnified: float) -> _VehicleP
     """Where the parts of all vehicles lie."""
     plants, n, arm = scene.plants, len(scene.plants), magnified * scene.arm
     p, R_BI = plants[:, POSITION], rotation_body_from_inertial(plants[:, ATTITUDE])
+    arms = np.concatenate([scene.arms, np.zeros((len(scene.arms), 1))], axis=1)
     disc = np.concatenate([CIRCLE, np.zeros((len(CIRCLE), 1))], axis=1)
     forces = plants[:, FORCES] / scene.forces[0]
-    bars = arm * (_ARMS + forces[..., None] * (0.0, 0.0, -1.0))  # thrust points up, -z of the body
-    discs = arm * (_ARMS[:, None] + _ROTOR * disc).reshape(-1, 3)
-    body = np.concatenate([np.broadcast_to(arm * _ARMS, (n, 4, 3)), bars, np.tile(discs, (n, 1, 1))], axis=1)
+    bars = arm * (arms + forces[..., None] * (0.0, 0.0, -1.0))  # thrust points up, -z of the body
+    discs = arm * (arms[:, None] + _ROTOR * disc).reshape(-1, 3)
+    body = np.concatenate([np.broadcast_to(arm * arms, (n, 4, 3)), bars, np.tile(discs, (n, 1, 1))], axis=1)
     pixels = canvas.pixels(p[:, None] + body @ R_BI)  # row vectors, so that R_BI leads back to inertial axes
     reach = (1.0 + _ROTOR) * arm * canvas.scale
     return _VehiclePixels(

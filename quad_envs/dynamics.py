@@ -29,10 +29,13 @@ from .parameters import (
     INV_JZ,
     INV_MASS,
     N_INPUT,
+    N_MOTION_COEFFICIENTS,
     N_STATE,
+    PITCH_CROSS,
     PITCH_GAIN,
     POSITION,
     RATES,
+    ROLL_CROSS,
     ROLL_GAIN,
     ROTOR_RATE,
     VELOCITY,
@@ -52,10 +55,10 @@ _Y = 20  # state at the present stage
 _ACC = 32  # weighted sum of the stage derivatives
 _TORQUE = 44  # disturbance torque at the present stage, body axes
 _FORCE = 47  # disturbance force at the present stage, inertial axes
-_COEFFICIENTS = 50  # the first twelve of QuadrotorParams.coefficients()
-_DECAY = 62  # rotor decay at the present stage
-_DECAY_NONE, _DECAY_HALF, _DECAY_WHOLE = 63, 64, 65  # after no, half and a whole substep
-SCRATCH_ROWS = 66
+_COEFFICIENTS = 50  # the first N_MOTION_COEFFICIENTS of QuadrotorParams.coefficients()
+_DECAY = 64  # rotor decay at the present stage
+_DECAY_NONE, _DECAY_HALF, _DECAY_WHOLE = 65, 66, 67  # after no, half and a whole substep
+SCRATCH_ROWS = 68
 
 
 @inline_kernel
@@ -97,9 +100,29 @@ def rigid_body(
         p + st * turn,
         cf * q - sf * r,
         turn,
-        c[GYRO_X] * q * r + c[ROLL_GAIN] * (F[3] - F[1]) + c[INV_JX] * d[0],
-        c[GYRO_Y] * p * r + c[PITCH_GAIN] * (F[0] - F[2]) + c[INV_JY] * d[1],
+        c[GYRO_X] * q * r + c[ROLL_GAIN] * (F[3] - F[1]) + c[ROLL_CROSS] * (F[2] - F[0]) + c[INV_JX] * d[0],
+        c[GYRO_Y] * p * r + c[PITCH_GAIN] * (F[0] - F[2]) + c[PITCH_CROSS] * (F[3] - F[1]) + c[INV_JY] * d[1],
         c[GYRO_Z] * p * q + c[YAW_GAIN] * (F[1] - F[0] + F[3] - F[2]) + c[INV_JZ] * d[2],
+    )
+
+
+@inline_kernel
+def rotor_shares(
+    alpha_x: float, alpha_y: float, alpha_z: float, c: Array
+) -> tuple[float, float, float, float]:
+    """Rotor forces, N, that turn the body with these angular accelerations, rad/s^2: M^-1 [0; J alpha].
+
+    The rows of the mixer are orthogonal, so that a torque is shared in proportion to its row.
+    """
+    t = c[ROLL_CROSS] / c[ROLL_GAIN]  # tan(delta), the same for pitch
+    roll = 0.5 * alpha_x / c[ROLL_GAIN] / (1.0 + t * t)
+    pitch = 0.5 * alpha_y / c[PITCH_GAIN] / (1.0 + t * t)
+    yaw = 0.25 * alpha_z / c[YAW_GAIN]
+    return (
+        pitch - t * roll - yaw,
+        yaw - roll - t * pitch,
+        t * roll - pitch - yaw,
+        roll + t * pitch + yaw,
     )
 
 
@@ -181,7 +204,9 @@ def _lane_stage(w: Array, j: Int, stride: Int, weight: float, ahead: float) -> N
         _lagged(F[3], command[3], decay),
     )
     d = (*_four(w, _TORQUE * stride + j, stride)[:3], *_four(w, _FORCE * stride + j, stride)[:3])
-    k = rigid_body(_twelve(w, _Y * stride + j, stride), F, d, _twelve(w, _COEFFICIENTS * stride + j, stride))
+    o = (_COEFFICIENTS + 12) * stride + j
+    c = (*_twelve(w, _COEFFICIENTS * stride + j, stride), w[o], w[o + stride])
+    k = rigid_body(_twelve(w, _Y * stride + j, stride), F, d, c)
     _accumulate(w, j, stride, k[0], weight, ahead)
     _accumulate(w, j + stride, stride, k[1], weight, ahead)
     _accumulate(w, j + 2 * stride, stride, k[2], weight, ahead)
@@ -252,7 +277,7 @@ def load_vehicle(
     stride: Int,
     plant: Array,
     command: Array,
-    force_max: float,
+    force_max: Array,
     coefficients: Array,
     h: float,
 ) -> None:
@@ -264,7 +289,7 @@ def load_vehicle(
         stride: 1 or LANES.
         plant: [p, V_B, Theta, Omega, F], (16,).
         command: Rotor commands, (4,), N; the plant saturates them to [0, force_max], Eq. (2.39).
-        force_max: Largest rotor force, N.
+        force_max: Largest force of each rotor, (4,), N.
         coefficients: QuadrotorParams.coefficients().
         h: Substep, s.
     """
@@ -274,10 +299,10 @@ def load_vehicle(
         w[(_ACC + i) * stride + j] = 0.0
     for i in range(N_INPUT):
         w[(_F + i) * stride + j] = plant[N_STATE + i]
-        w[(_CMD + i) * stride + j] = min(max(command[i], 0.0), force_max)
+        w[(_CMD + i) * stride + j] = min(max(command[i], 0.0), force_max[i])
     for i in range(6):
         w[(_TORQUE + i) * stride + j] = 0.0
-    for i in range(12):
+    for i in range(N_MOTION_COEFFICIENTS):
         w[(_COEFFICIENTS + i) * stride + j] = coefficients[i]
     half = np.exp(-0.5 * coefficients[ROTOR_RATE] * h)
     w[_DECAY_NONE * stride + j] = 1.0
@@ -342,7 +367,7 @@ def advance(
 def _simulate(
     plants: Array,
     commands: Array,
-    force_max: float,
+    force_max: Array,
     coefficients: Array,
     substeps: int,
     h: float,
@@ -360,12 +385,18 @@ def _simulate(
 NO_DISTURBANCE = np.zeros((1, 0, 1, 6))
 
 
+def rotor_limits(force_max: ArrayLike | None, params: QuadrotorParams) -> Array:
+    """Upper saturation of each rotor force, (4,), N; None for the weight (kappa = 1)."""
+    most = params.weight if force_max is None else np.asarray(force_max, dtype=np.float64)
+    return np.array(np.broadcast_to(most, N_INPUT), dtype=np.float64)
+
+
 def simulate(
     plant: ArrayLike,
     command: ArrayLike,
     params: QuadrotorParams,
     *,
-    force_max: float | None = None,
+    force_max: ArrayLike | None = None,
     duration: float = 0.05,
     substeps: int = 5,
 ) -> Array:
@@ -375,7 +406,7 @@ def simulate(
         plant: [p, V_B, Theta, Omega, F], (..., 16).
         command: Rotor commands, (..., 4), N.
         params: The vehicle.
-        force_max: Upper saturation of the rotor forces, N; None for the weight (kappa = 1).
+        force_max: Upper saturation of the rotor forces, N: one number or (4,); None for the weight.
         duration: s.
         substeps: RK4 steps.
 
@@ -390,7 +421,7 @@ def simulate(
     _simulate(
         plants,
         commands.reshape(-1, N_INPUT),
-        params.weight if force_max is None else float(force_max),
+        rotor_limits(force_max, params),
         params.coefficients(),
         substeps,
         duration / substeps,

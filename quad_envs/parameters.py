@@ -26,16 +26,20 @@ FORCES = slice(12, 16)  # rotor forces, appended to the state in plant rows
     GYRO_X,  # (Jy - Jz) / Jx
     GYRO_Y,  # (Jz - Jx) / Jy
     GYRO_Z,  # (Jx - Jy) / Jz
-    ROLL_GAIN,  # L / Jx, rad/s^2 per N
-    PITCH_GAIN,  # L / Jy, rad/s^2 per N
+    ROLL_GAIN,  # L cos(delta) / Jx, rad/s^2 per N
+    PITCH_GAIN,  # L cos(delta) / Jy, rad/s^2 per N
     YAW_GAIN,  # c / Jz, rad/s^2 per N
     INV_JX,  # 1/(kg m^2)
     INV_JY,
     INV_JZ,
+    ROLL_CROSS,  # L sin(delta) / Jx, rad/s^2 per N, 0 with the arms along the axes
+    PITCH_CROSS,  # L sin(delta) / Jy, rad/s^2 per N
     ROTOR_RATE,  # lambda_F, 1/s
     HOVER_FORCE,  # u_T, N
-) = range(14)
-N_COEFFICIENTS = 14
+) = range(16)
+N_COEFFICIENTS = 16
+N_MOTION_COEFFICIENTS = 14  # the first ones, of the rigid body
+FRAMES = {"plus": 0.0, "x": math.pi / 4.0}  # delta, rad: from the x axis to the arm of rotor 1
 MOST_KAPPA = 20.0  # thrust-to-weight 80, beyond any vehicle; the dissertation has 1
 
 
@@ -46,10 +50,14 @@ def _require_positive(name: str, value: float, unit: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class QuadrotorParams:
-    """Physical parameters of a plus-configured quadrotor, section 9.4 of the dissertation.
+    """Physical parameters of a quadrotor, section 9.4 of the dissertation.
+
+    Seen from above, rotors 1 to 4 follow each other clockwise. With the plus frame rotor 1 is in front, on
+    the x axis; the x frame is turned clockwise by 45 degrees: front right, back right, back left, front left.
+    Rotors 1 and 3 turn clockwise, and their drag turns the body the other way.
 
     Raises:
-        ValueError: If a parameter is not finite or not positive (drag may be zero).
+        ValueError: If a parameter is not finite or not positive (drag may be zero), or the frame is unknown.
     """
 
     mass: float = 0.8  # kg
@@ -59,6 +67,7 @@ class QuadrotorParams:
     yaw_moment: float = 0.002167  # m, yaw torque per rotor force
     rotor_rate: float = 50.0  # 1/s, lambda_F of Eq. (2.38), a rate and not a time constant
     drag: float = 0.0  # kg/s, linear drag on the body velocity (0 in the dissertation)
+    frame: str = "plus"  # or "x"
 
     def __post_init__(self) -> None:
         for name, unit in (
@@ -75,6 +84,8 @@ class QuadrotorParams:
             _require_positive(f"inertia J{axis}", float(moment), "kg m^2")
         if not (math.isfinite(self.drag) and self.drag >= 0.0):
             raise ValueError(f"drag must be a finite number >= 0 kg/s, got {self.drag!r}")
+        if self.frame not in FRAMES:
+            raise ValueError(f"frame must be one of {', '.join(map(repr, FRAMES))}, got {self.frame!r}")
 
     @property
     def weight(self) -> float:
@@ -86,10 +97,22 @@ class QuadrotorParams:
         """u_T = m g / 4, the force of each rotor in hover, N."""
         return self.weight / 4.0
 
+    @property
+    def arm_lengths(self) -> tuple[float, float]:
+        """L cos(delta) and L sin(delta): the place of rotor 1, m."""
+        delta = FRAMES[self.frame]
+        return self.arm * math.cos(delta), self.arm * math.sin(delta)
+
+    def rotor_positions(self) -> Array:
+        """Rotors 1 to 4 in body axes (forward, right), (4, 2), m."""
+        a, b = self.arm_lengths
+        return np.array([[a, b], [-b, a], [-a, -b], [b, -a]])
+
     def mixer(self) -> Array:
         """M with [T; tau] = M F, (4, 4): total thrust (N) and torques (N m) of the rotor forces."""
-        L, c = self.arm, self.yaw_moment
-        return np.array([[1.0, 1.0, 1.0, 1.0], [0.0, -L, 0.0, L], [L, 0.0, -L, 0.0], [-c, c, -c, c]])
+        x, y = self.rotor_positions().T
+        spin = self.yaw_moment * np.array([-1.0, 1.0, -1.0, 1.0])
+        return np.stack([np.ones(N_INPUT), -y, x, spin])
 
     def input_matrix(self) -> Array:
         """B_c of Eq. (2.35) with its missing thrust row restored, (12, 4)."""
@@ -102,6 +125,7 @@ class QuadrotorParams:
     def coefficients(self) -> Array:
         """What the equations of motion use of the parameters, in kernel order, (N_COEFFICIENTS,)."""
         Jx, Jy, Jz = self.inertia
+        along, across = self.arm_lengths
         return np.array(
             [
                 self.gravity,
@@ -110,12 +134,14 @@ class QuadrotorParams:
                 (Jy - Jz) / Jx,
                 (Jz - Jx) / Jy,
                 (Jx - Jy) / Jz,
-                self.arm / Jx,
-                self.arm / Jy,
+                along / Jx,
+                along / Jy,
                 self.yaw_moment / Jz,
                 1.0 / Jx,
                 1.0 / Jy,
                 1.0 / Jz,
+                across / Jx,
+                across / Jy,
                 self.rotor_rate,
                 self.hover_force,
             ]
@@ -133,7 +159,8 @@ class Limits:
         ValueError: If kappa leaves no hover, a limit is not positive, or the position box is empty.
     """
 
-    kappa: float = 1.0  # -, largest rotor force as a fraction of the weight, Eq. (2.39)
+    # -, largest rotor force as a fraction of the weight, Eq. (2.39): one number, or one per rotor
+    kappa: float | tuple[float, ...] = 1.0
     rate: float = math.inf  # N/s, change of each rotor command
     tilt: float = math.inf  # rad, |roll| and |pitch|
     velocity: float = math.inf  # m/s, each body velocity component
@@ -141,12 +168,16 @@ class Limits:
     position_upper: tuple[float, float, float] = (math.inf, math.inf, math.inf)  # m, NED
 
     def __post_init__(self) -> None:
-        if not 0.25 < self.kappa <= MOST_KAPPA:
-            raise ValueError(
-                "kappa, the largest rotor force as a fraction of the weight, must lie in "
-                f"(1/4, {MOST_KAPPA:g}], above 1/4 so that hover is feasible, got {self.kappa!r}; "
-                "it is a quarter of the thrust-to-weight ratio; 0.3125 gives the dissertation's 2.45 N"
-            )
+        if len(self.kappas) != N_INPUT:
+            raise ValueError(f"kappa must be one number or one per rotor, got {self.kappa!r}")
+        for i, kappa in enumerate(self.kappas):
+            if not 0.25 < kappa <= MOST_KAPPA:
+                which = f" for rotor {i + 1}" if isinstance(self.kappa, tuple) else ""
+                raise ValueError(
+                    "kappa, the largest rotor force as a fraction of the weight, must lie in "
+                    f"(1/4, {MOST_KAPPA:g}], got {kappa!r}{which}; hover needs m g / 4 of every rotor. "
+                    "It is a quarter of the thrust-to-weight ratio; 0.3125 gives the dissertation's 2.45 N"
+                )
         for name, unit in (("rate", "N/s"), ("tilt", "rad"), ("velocity", "m/s")):
             value = getattr(self, name)
             if math.isnan(value) or value <= 0.0:
@@ -158,6 +189,11 @@ class Limits:
         for axis, low, high in zip("xyz", self.position_lower, self.position_upper, strict=True):
             if math.isnan(low) or math.isnan(high) or not low < high:
                 raise ValueError(f"position limit on {axis} needs lower < upper, got [{low!r}, {high!r}] m")
+
+    @property
+    def kappas(self) -> tuple[float, ...]:
+        """The largest force of each rotor as a fraction of the weight, (4,)."""
+        return self.kappa if isinstance(self.kappa, tuple) else (self.kappa,) * N_INPUT
 
     @property
     def has_position(self) -> bool:

@@ -63,8 +63,9 @@ class Scene(NamedTuple):
     view: Array  # (4,), part of the image plane that must be seen: left, bottom, right, top, m
     ground: tuple[float, float, float, float]  # middle x, y, z and radius of the grid, m
     arm: float  # m
+    arms: Array  # (4, 2), places of the rotors over the arm, body axes
     separation: float  # m, 0 for none
-    forces: tuple[float, float]  # rotor force in hover, largest, N
+    forces: tuple[float, Array]  # rotor force in hover; largest, (4,), N
 
 
 def project(points: ArrayLike) -> Array:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from .agent_observations import AgentLayout
 from .constraints import constraint_names
 from .observations import TrackingLayout
-from .parameters import Limits, QuadrotorParams, Weights
+from .parameters import Array, Limits, QuadrotorParams, Weights
 
 _Triple = tuple[float, float, float]
 LOSS_PARTS = ("position", "velocity", "attitude", "rates", "effort", "formation")  # of the stage cost
@@ -43,9 +45,9 @@ class BaseTask:
         return self.params.hover_force
 
     @property
-    def force_max(self) -> float:
-        """Rotor force of action +1, kappa m g, N."""
-        return self.limits.kappa * self.params.weight
+    def force_max(self) -> Array:
+        """Force of action +1 of each rotor, kappa m g, (4,), N."""
+        return np.array(self.limits.kappas) * self.params.weight
 
 
 @dataclass(frozen=True, slots=True)

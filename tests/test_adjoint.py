@@ -121,7 +121,7 @@ def test_the_adjoint_of_a_step_with_its_reward_is_the_derivative_of_both():
     found = np.zeros((20, 16)), np.zeros((20, 4)), np.zeros((20, 4))
     tracking_vjp_rows(
         plants, commands, previous, simulate(plants, commands, params, force_max=force_max), references,
-        np.zeros(20, dtype=np.bool_), np.full(20, force_max), np.tile(params.coefficients(), (20, 1)),
+        np.zeros(20, dtype=np.bool_), np.tile(force_max, (20, 1)), np.tile(params.coefficients(), (20, 1)),
         task, bars, bar_rewards, 0.0, *found, np.zeros((SCRATCH_ROWS + 4, 16)),
     )  # fmt: skip
     assert np.allclose(found[0], differences(lambda x: value(x, commands, previous), plants), atol=1e-6)

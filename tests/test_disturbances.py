@@ -95,7 +95,7 @@ VEHICLES = {
 @pytest.mark.parametrize(("params", "limits"), VEHICLES.values(), ids=VEHICLES)
 def test_the_authority_is_where_the_first_rotor_in_equilibrium_meets_its_limit(params, limits):
     found = hover_authority(params, limits)
-    top, inverse = limits.kappa * params.weight, np.linalg.inv(params.mixer())
+    top, inverse = min(limits.kappas) * params.weight, np.linalg.inv(params.mixer())
     for i, torque in enumerate(found[:3]):
         for sign in (1.0, -1.0):
             demand = np.zeros(4)

@@ -183,16 +183,16 @@ def test_a_block_of_lanes_equals_one_vehicle_at_a_time_bit_for_bit():
 
 
 @kernel
-def _block(plants, commands, coefficients, w, index, none):
+def _block(plants, commands, force_max, coefficients, w, index, none):
     for j in range(LANES):
-        load_vehicle(w, j, np.int64(LANES), plants[j], commands[j], 7.84, coefficients, 0.01)
+        load_vehicle(w, j, np.int64(LANES), plants[j], commands[j], force_max, coefficients, 0.01)
     advance(w, np.int64(LANES), LANES, 0, 5, 0.01, none, index, index)
     for j in range(LANES):
         store_vehicle(w, j, np.int64(LANES), plants[j])
 
 
 def _advance_block(plants, commands, coefficients, w, index):
-    _block(plants, commands, coefficients, w, index, NO_DISTURBANCE)
+    _block(plants, commands, np.full(4, PARAMS.weight), coefficients, w, index, NO_DISTURBANCE)
 
 
 def test_a_state_that_would_not_stay_finite_is_left_as_it_was():

@@ -116,5 +116,7 @@ def test_sdre_without_a_riccati_solution_takes_the_gain_at_hover():
 
 def test_limited_command_prefers_the_box_to_the_rate():
     out = np.empty(4)
-    limit_command(np.array([9.0, -9.0, np.nan, 2.1]), np.array([3.0, 0.1, 2.0, 2.0]), 0.25, 2.45, out)
+    limit_command(
+        np.array([9.0, -9.0, np.nan, 2.1]), np.array([3.0, 0.1, 2.0, 2.0]), 0.25, np.full(4, 2.45), out
+    )
     np.testing.assert_allclose(out, [2.45, 0.0, 2.0, 2.1])

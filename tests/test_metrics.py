@@ -103,7 +103,7 @@ def test_what_a_crash_cuts_short_is_nan():
 def test_saturation_is_the_share_of_rotor_commands_at_a_face_of_the_box():
     task = Task(limits=Limits(kappa=0.5))
     commands = np.full((STEPS, 4), task.hover_force)
-    commands[:50, 0], commands[:, 1] = 0.0, task.force_max
+    commands[:50, 0], commands[:, 1] = 0.0, task.force_max[1]
     assert measure(flight(task, commands=commands)).saturation_share == pytest.approx(
         (50 + STEPS) / (4 * STEPS)
     )

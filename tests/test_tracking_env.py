@@ -276,7 +276,7 @@ def test_quadratic_reward_is_minus_cost_and_penalty():
     [
         ({"kapa": 0.5}, TypeError, "unexpected keyword argument 'kapa' of .*did you mean 'kappa'"),
         ({"kappa": 0.2}, ValueError, "kappa"),
-        ({"kappa": "abc"}, ValueError, "kappa must be a number, got 'abc'"),
+        ({"kappa": "abc"}, ValueError, "kappa must be a number or 4 of them, one per rotor, got 'abc'"),
         ({"dt": -1.0}, ValueError, "dt"),
         ({"substeps": 0}, ValueError, "substeps"),
         ({"preview": 2.5}, ValueError, "preview"),

@@ -67,8 +67,9 @@ def task_facts(task: BaseTask) -> dict[str, Any]:
     facts = {key: value for key, value in asdict(task).items() if key != "layout"}
     derived = {
         "constraint_names": task.constraint_names,
-        "force_max": task.force_max,
+        "force_max": task.force_max.tolist(),
         "hover_force": task.hover_force,
+        "rotors": (task.params.rotor_positions() / task.params.arm).tolist(),
         "tolerance": TOLERANCE,
         "mission": task.mission if isinstance(task, TeamTask) else "tracking",
     }

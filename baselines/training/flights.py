@@ -44,7 +44,7 @@ class Record(NamedTuple):
     after: Array  # (n, 16), afterwards, before any reset
     references: Array  # (n, 8), of the time afterwards
     crashed: Bools  # (n,)
-    force_max: Array  # (n,), N
+    force_max: Array  # (n, 4), N
     coefficients: Array  # (n, N_COEFFICIENTS)
     slopes: Array  # (n, 4), of the commands by the actions
     rewards: Array  # (n,)

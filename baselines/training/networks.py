@@ -169,9 +169,9 @@ class Network:
         return int(self.weights[-1].shape[1])
 
 
-def _hover_gain(task: BaseTask) -> float:
-    """Slope of `hover_actions` above hover."""
-    return float(task.hover_force / (task.force_max - task.hover_force))
+def _hover_gain(task: BaseTask, dtype: Any) -> NDArray[Any]:
+    """Slope of `hover_actions` above hover, of each rotor, (4,)."""
+    return np.asarray(task.hover_force / (task.force_max - task.hover_force), dtype=dtype)
 
 
 def hover_actions(outputs: Floats, task: BaseTask) -> Floats:
@@ -182,13 +182,13 @@ def hover_actions(outputs: Floats, task: BaseTask) -> Floats:
     """
     out = outputs.copy()
     rotors = out[..., :4]
-    np.copyto(rotors, np.minimum(np.where(rotors < 0.0, rotors, _hover_gain(task) * rotors), 1.0))
+    np.copyto(rotors, np.minimum(np.where(rotors < 0.0, rotors, _hover_gain(task, out.dtype) * rotors), 1.0))
     return out
 
 
 def hover_slopes(outputs: Floats, task: BaseTask) -> Array:
     """Derivative of `hover_actions` by each of four outputs; 0 where the rotor box cuts."""
-    gain = _hover_gain(task)
+    gain = _hover_gain(task, np.float64)
     return np.where(outputs < 0.0, 1.0, np.where(gain * outputs < 1.0, gain, 0.0))
 
 
@@ -196,7 +196,7 @@ def hover_outputs(actions: Floats, task: BaseTask) -> Floats:
     """The outputs of which `hover_actions` makes these actions, within [-1, 1]."""
     out = actions.copy()
     rotors = out[..., :4]
-    np.copyto(rotors, np.minimum(np.where(rotors < 0.0, rotors, rotors / _hover_gain(task)), 1.0))
+    np.copyto(rotors, np.minimum(np.where(rotors < 0.0, rotors, rotors / _hover_gain(task, out.dtype)), 1.0))
     return out
 
 
@@ -234,7 +234,8 @@ class NetworkPolicy:
         self._layers = [first, *zip(network.weights[1:], network.biases[1:], strict=True)]
         self._sizes = np.array([len(self._columns), *(len(b) for _, b in self._layers)], dtype=np.int64)
         self._flat = np.concatenate([part.reshape(-1) for layer in self._layers for part in layer])
-        self._gain = np.float32(_hover_gain(task) if network.commands == "hover" else 1.0)
+        hover = network.commands == "hover"
+        self._gain = _hover_gain(task, np.float32) if hover else np.ones(4, dtype=np.float32)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.name!r}, {self.task.env_id!r})"

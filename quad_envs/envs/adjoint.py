@@ -190,7 +190,7 @@ def tracking_vjp_rows(
         after: Plants after the step, (n, 16).
         references: Rows of the time after the step, (n, 8).
         crashed: (n,), flights that ended in a crash: their reward is 0 and leads nowhere.
-        force_max: Rotor saturation of each, (n,), N.
+        force_max: Rotor saturation of each, (n, 4), N.
         coefficients: Of each, (n, N_COEFFICIENTS).
         task: Task vector.
         bars: Sensitivity to the plants afterwards, (n, 16).
@@ -235,4 +235,4 @@ def action_slopes(actions: NDArray[np.floating], task: Array, out: Array) -> Non
             a = actions[j, i]
             out[j, i] = 0.0
             if -1.0 <= a <= 1.0:
-                out[j, i] = task[HOVER] if a < 0.0 else task[ACTION_MAX] - task[HOVER]
+                out[j, i] = task[HOVER] if a < 0.0 else task[ACTION_MAX][i] - task[HOVER]

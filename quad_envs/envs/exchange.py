@@ -23,16 +23,16 @@ from .kernel import DT, PREVIEW, STEP, encode_vehicle
 IntArray = NDArray[np.int64]
 
 # Entries of a vehicle's row beyond those of `kernel`.
-TERMS = 49  # of the stage cost (6) and the scaled violation of each named row (at most 5)
-SLOT_ERROR = 60  # m, distance to the wanted position
-NEAREST = 61  # m, distance to the nearest vehicle, smallest over the substeps
-HEARD = 62  # messages received in this step
-ALIVE = 63
-MEASURES = 64  # whether it has the sensor
-CAUSE = 65  # why it crashed, index in `tasks.CRASH_CAUSES`
-TERMINATED = 66
-LEFT = 67  # whether it crashed in an earlier step
-TEAM_ROW_SIZE = 72
+TERMS = 54  # of the stage cost (6) and the scaled violation of each named row (at most 5)
+SLOT_ERROR = 65  # m, distance to the wanted position
+NEAREST = 66  # m, distance to the nearest vehicle, smallest over the substeps
+HEARD = 67  # messages received in this step
+ALIVE = 68
+MEASURES = 69  # whether it has the sensor
+CAUSE = 70  # why it crashed, index in `tasks.CRASH_CAUSES`
+TERMINATED = 71
+LEFT = 72  # whether it crashed in an earlier step
+TEAM_ROW_SIZE = 73
 
 # Entries of a message's content, absolute.
 N_MOTION = 10  # p 3, v 3 (inertial), phi, theta, sin psi, cos psi

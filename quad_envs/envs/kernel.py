@@ -23,20 +23,21 @@ from .vehicle_options import CRASH_TILT
 PLANT = slice(0, 16)  # [p, V_B, Theta, Omega, F]
 COMMAND = slice(16, 20)  # last rotor commands, N
 COEFFICIENTS = slice(20, 20 + N_COEFFICIENTS)  # of the true vehicle
-FORCE_MAX = 34  # rotor saturation of the true vehicle, N
-REWARD, STAGE_COST, COST, EPISODE_COST, VIOLATED, CRASHED, TRUNCATED, CLIPPED, STEP = range(35, 44)
-SCORES = slice(35, 44)  # these nine
-VALUES = 44  # constraint values, one per named row, at most four
-ROW_SIZE = 48
+FORCE_MAX = slice(36, 40)  # rotor saturation of the true vehicle, N
+REWARD, STAGE_COST, COST, EPISODE_COST, VIOLATED, CRASHED, TRUNCATED, CLIPPED, STEP = range(40, 49)
+SCORES = slice(40, 49)  # these nine
+VALUES = 49  # constraint values, one per named row, at most four
+ROW_SIZE = 53
 SCRATCH_SIZE = SCRATCH_ROWS * LANES + 4 * LANES + 16  # integrator, previous commands, one measured plant
 
 # Entries of the task vector. It ends with the diagonals of Q and R.
-DT, SUBSTEPS, HOVER, ACTION_MAX, EPISODE_STEPS, PREVIEW, QUADRATIC, LOST = range(8)
-SEES_POSITION, SEES_DISTURBANCE, TILT, VELOCITY, HAS_POSITION, RATE_STEP, TILT_OF_CRASH = range(8, 15)
-LOWER = slice(15, 18)
-UPPER = slice(18, 21)
-WEIGHT_Q = slice(21, 33)
-WEIGHT_R = slice(33, 37)
+DT, SUBSTEPS, HOVER, EPISODE_STEPS, PREVIEW, QUADRATIC, LOST = range(7)
+SEES_POSITION, SEES_DISTURBANCE, TILT, VELOCITY, HAS_POSITION, RATE_STEP, TILT_OF_CRASH = range(7, 14)
+LOWER = slice(14, 17)
+UPPER = slice(17, 20)
+ACTION_MAX = slice(20, 24)  # force of action +1, N
+WEIGHT_Q = slice(24, 36)
+WEIGHT_R = slice(36, 40)
 
 BLOCK_FROM = 8  # rows from which a block of lanes is faster than one row at a time
 
@@ -49,7 +50,6 @@ def task_vector(task: Task | TeamTask, substeps: int, lost_distance: float) -> A
             task.dt,
             substeps,
             task.hover_force,
-            task.force_max,
             task.episode_steps,
             task.layout.preview,
             task.reward == "quadratic",
@@ -63,6 +63,7 @@ def task_vector(task: Task | TeamTask, substeps: int, lost_distance: float) -> A
             CRASH_TILT,
             *limits.position_lower,
             *limits.position_upper,
+            *task.force_max,
             *task.weights.Q,
             *task.weights.R,
         ],
@@ -207,7 +208,7 @@ def apply_action(row: Array, actions: NDArray[np.floating], task: Array) -> None
         if action < -1.0 or action > 1.0:
             row[CLIPPED] += 1.0
             action = min(max(action, -1.0), 1.0)
-        row[COMMAND][i] = force_from_action(action, task[HOVER], task[ACTION_MAX])
+        row[COMMAND][i] = force_from_action(action, task[HOVER], task[ACTION_MAX][i])
 
 
 @kernel

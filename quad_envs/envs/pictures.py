@@ -151,6 +151,7 @@ class Pictures:
             view=self._framing.view(k, np.concatenate([plants[:, POSITION], aim[-1:]])),
             ground=self._framing.ground(k),
             arm=task.params.arm,
+            arms=task.params.rotor_positions() / task.params.arm,
             separation=float(getattr(task, "separation", 0.0)),
             forces=(task.hover_force, task.force_max),
         )

@@ -69,16 +69,16 @@ def stage_times(task: BaseTask, substeps: int) -> Array:
 
 def draw_vehicle(
     task: BaseTask, randomization: Mapping[str, float], rng: np.random.Generator
-) -> tuple[Array, float]:
-    """Coefficients and rotor saturation of a true vehicle; without randomization nothing is drawn."""
-    params, kappa = task.params, task.limits.kappa
+) -> tuple[Array, Array]:
+    """Coefficients and rotor saturation (4,) of a true vehicle; without randomization nothing is drawn."""
+    params, force_max = task.params, task.force_max
     if randomization:
         change = {
             name: 1.0 + spread * rng.uniform(-1.0, 1.0, 3 if name == "inertia" else None)
             for name, spread in randomization.items()
         }
-        kappa *= float(change.pop("kappa", 1.0))
+        force_max *= float(change.pop("kappa", 1.0))
         inertia = np.asarray(params.inertia) * change.pop("inertia", 1.0)
         scaled = {name: getattr(params, name) * float(factor) for name, factor in change.items()}
         params = replace(params, inertia=tuple(inertia.tolist()), **scaled)
-    return params.coefficients(), kappa * task.params.weight
+    return params.coefficients(), force_max

@@ -57,11 +57,11 @@ class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     `task.constraint_names`), `stage_cost`, `crashed`, `clipped_actions`.
 
     ## Arguments
-    Vehicle: `mass` 0.8 kg, `gravity` 9.8 m/s^2, `inertia` (0.0224, 0.0224, 0.0436) kg m^2, `arm` 0.165 m,
-    `yaw_moment`
-        0.002167 m, `rotor_rate` 50 1/s, `drag` 0 kg/s.
-    Limits: `kappa` 1 (largest rotor force as a fraction of the weight, in (1/4, 20]), `rate_limit` N/s per
-    rotor,
+    Vehicle: `vehicle` (a name of `quad_envs.vehicles.VEHICLES`, whose values the others override), `frame`
+        "plus" or "x", `mass` 0.8 kg, `gravity` 9.8 m/s^2, `inertia` (0.0224, 0.0224, 0.0436) kg m^2, `arm`
+        0.165 m, `yaw_moment` 0.002167 m, `rotor_rate` 50 1/s, `drag` 0 kg/s.
+    Limits: `kappa` 1 (largest rotor force as a fraction of the weight, in (1/4, 20]; one number, or one per
+    rotor), `rate_limit` N/s per rotor,
         `tilt_limit` rad on |roll| and |pitch|, `velocity_limit` m/s on each body velocity, `position_limit`
         ((x, y, z) lower, (x, y, z) upper) m. No limit but kappa by default.
     Task: `reference` (a name, a .csv path or a Reference), `start` (3 or 12 numbers), `start_box` (half

@@ -12,11 +12,12 @@ import numpy as np
 
 from ..disturbances import Disturbance, beyond_authority, disturbance_of
 from ..names import suggestion
-from ..parameters import N_STATE, Limits, QuadrotorParams, Weights
+from ..parameters import N_INPUT, N_STATE, Limits, QuadrotorParams, Weights
+from ..vehicles import vehicle_values
 
 # Arguments that are one number; what it may be is checked where it is used.
 _NUMBERS = (
-    *("mass", "gravity", "arm", "yaw_moment", "rotor_rate", "drag", "kappa", "rate_limit", "tilt_limit"),
+    *("mass", "gravity", "arm", "yaw_moment", "rotor_rate", "drag", "rate_limit", "tilt_limit"),
     *("velocity_limit", "dt", "time_limit"),
 )
 _MOST_STEPS = 1_000_000  # control periods of an episode; its tables are made at reset
@@ -33,6 +34,7 @@ class VehicleOptions:
     kind: ClassVar[str] = ""  # of environment, for messages
 
     env_id: str = ""
+    vehicle: str = "dissertation"
     mass: float = 0.8
     gravity: float = 9.8
     inertia: Triple = (0.0224, 0.0224, 0.0436)
@@ -40,7 +42,8 @@ class VehicleOptions:
     yaw_moment: float = 0.002167
     rotor_rate: float = 50.0
     drag: float = 0.0
-    kappa: float = 1.0
+    frame: str = "plus"
+    kappa: float | tuple[float, float, float, float] = 1.0
     rate_limit: float = math.inf
     tilt_limit: float = math.inf
     velocity_limit: float = math.inf
@@ -60,6 +63,7 @@ class VehicleOptions:
         for name in _NUMBERS:
             if not isinstance(getattr(self, name), int | float | np.integer | np.floating):
                 raise ValueError(f"{name} must be a number, got {getattr(self, name)!r}")
+        vehicle_values(self.vehicle)
         for name in ("dt", "time_limit"):
             self.require_positive(name)
         steps = self.time_limit / self.dt
@@ -70,6 +74,11 @@ class VehicleOptions:
             )
         if not isinstance(self.reveal_disturbance, bool | np.bool_):
             raise ValueError(f"reveal_disturbance must be True or False, got {self.reveal_disturbance!r}")
+        rotors = self.kappa if isinstance(self.kappa, tuple) else (self.kappa,) * N_INPUT
+        if len(rotors) != N_INPUT or not all(map(is_number, rotors)):
+            raise ValueError(
+                f"kappa must be a number or {N_INPUT} of them, one per rotor, got {self.kappa!r}"
+            )
         if not _is_vector(self.inertia):
             raise ValueError(f"inertia must be three numbers (Jx, Jy, Jz), got {self.inertia!r}")
         if self.position_limit is not None and not (
@@ -115,10 +124,11 @@ class VehicleOptions:
 
     @classmethod
     def from_kwargs(cls: type[Options], kwargs: Mapping[str, Any]) -> Options:
-        """Options from keyword arguments.
+        """Options from keyword arguments; they override those of a named vehicle.
 
         Raises:
             TypeError: If a name is unknown; the message suggests the nearest one.
+            ValueError: If a value is not allowed, or there is no such vehicle.
         """
         known = [entry.name for entry in fields(cls) if entry.init]
         for name in kwargs:
@@ -127,7 +137,8 @@ class VehicleOptions:
                 # Python's own words first: TorchRL's GymEnv tries `frameskip` and looks for them.
                 hint = suggestion(name, known)
                 raise TypeError(f"unexpected keyword argument {name!r} of {cls.kind} environment; {hint}")
-        return cls(**{name: _as_tuple(value) for name, value in kwargs.items()})
+        named = vehicle_values(kwargs["vehicle"]) if "vehicle" in kwargs else {}
+        return cls(**named | {name: _as_tuple(value) for name, value in kwargs.items()})
 
     @property
     def episode_steps(self) -> int:
@@ -156,6 +167,7 @@ class VehicleOptions:
             yaw_moment=self.yaw_moment,
             rotor_rate=self.rotor_rate,
             drag=self.drag,
+            frame=self.frame,
         )
 
     def make_disturbance(self) -> Disturbance | None:
@@ -197,7 +209,8 @@ class VehicleOptions:
                 raise ValueError(
                     "randomize['drag'] varies the drag in proportion: give the env a drag > 0 first"
                 )
-        if self.kappa * (1.0 - ranges.get("kappa", 0.0)) <= 0.25 * (1.0 + ranges.get("mass", 0.0)):
+        weakest = min(self.make_limits().kappas) * (1.0 - ranges.get("kappa", 0.0))
+        if weakest <= 0.25 * (1.0 + ranges.get("mass", 0.0)):
             raise ValueError(
                 f"randomize={self.randomize!r} would draw rotors too weak to hover at kappa = {self.kappa}"
             )

@@ -266,7 +266,7 @@ class Scene {
     const angles = attitude[vehicle].map((series) => series[Math.round(row)]);
     const reach = this.arm * this.factor;
     const body = (vector) => plus(place, rotate(angles, vector));
-    const arms = [[1, 0], [0, 1], [-1, 0], [0, -1]].map(([x, y]) => [reach * x, reach * y, 0]);
+    const arms = this.environment.task.rotors.map(([x, y]) => [reach * x, reach * y, 0]);
     const violated = constraints?.[vehicle].some((series) => series[Math.max(0, Math.ceil(row) - 1)] > this.environment.task.tolerance);
     if (violated) {
       const [x, y] = this.project(place);
@@ -285,7 +285,7 @@ class Scene {
       this.fill(rim, withAlpha(colour, i === 0 ? 0.75 : 0.25));
       this.path(rim, colour, i === 0 ? 1.6 : 1);
       if (forces) {
-        const share = forces[vehicle][i][Math.round(row)] / this.environment.task.force_max;
+        const share = forces[vehicle][i][Math.round(row)] / this.environment.task.force_max[i];
         this.path([body(arm), body([arm[0], arm[1], -1.5 * reach * share])], this.colours.ink, 1.3);
       }
     });

@@ -101,7 +101,8 @@ function forcePlot(context) {
     ];
     return table.map((values, rotor) => ({ values, dash: DASHES[rotor], name: `rotor ${rotor + 1}` }));
   });
-  const limits = [{ value: context.task.force_max, text: "max" }, { value: 0, text: "" }];
+  const limits = [...new Set(context.task.force_max)].map((value) => ({ value, text: "max" }));
+  limits.push({ value: 0, text: "" });
   const unit = isTeam(context) && context.focus === null ? "N, largest and smallest of a vehicle" : "N, four rotors";
   return { title: "Rotor forces", unit, groups, limits, zero: true, fine: true };
 }

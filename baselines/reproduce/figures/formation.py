@@ -39,7 +39,7 @@ def fly_path(flight: TeamFlight) -> TeamPath:
     episodes = team_episodes(flight)
     p = np.stack([episode.states[:, POSITION] for episode in episodes], axis=1)
     forces = np.stack([episode.commands for episode in episodes], axis=1)
-    return TeamPath(outcome_of(episodes), p, forces, episodes, episodes[0].task.force_max)
+    return TeamPath(outcome_of(episodes), p, forces, episodes, float(episodes[0].task.force_max.max()))
 
 
 @cache
