@@ -53,7 +53,7 @@ def test_the_command_line_lists_vehicles_and_flies_them(capsys):
     assert set(json.loads(capsys.readouterr().out)["vehicles"]) == set(VEHICLES)
     command = ["evaluate", "quad/HelixTracking-v0", "nmpc", "--set", "vehicle=crazyflie", "--json"]
     main([*command, "--episodes", "1"])
-    assert json.loads(capsys.readouterr().out)["counts"]["crashed"] == 0
+    assert json.loads(capsys.readouterr().out)["summary"]["score"]["mean"] > 0.7
 
 
 @pytest.mark.parametrize("name", VEHICLES)
