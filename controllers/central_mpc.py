@@ -33,6 +33,7 @@ from .disturbance import ESTIMATOR_GAIN
 from .fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, limit_command
 from .model import sdc_pair
 from .mpc import MpcOptions, mpc_data
+from .mpc_kernels import add_rotor_lag
 from .ocp import Condensed, OcpQp, condense, no_rows
 from .solvers.structured import ITERATION_LIMIT
 
@@ -209,7 +210,8 @@ class CentralMpc:
         """Each vehicle's dynamics and cost in its inputs, inertial axes."""
         data, N, found = self._data, self.horizon, []
         for plant, slot in zip(plants, slots, strict=True):
-            x = plant[:N_STATE]
+            x = plant[:N_STATE].copy()
+            add_rotor_lag(plant, np.full(N_INPUT, self.task.hover_force), data.B_c, data.lag, x)
             A, B = sdc_pair(x, self.task.params, self.task.dt, self.alpha)
             r = np.zeros((N + 1, N_STATE))
             r[:, POSITION] = rows[:, :3] + slot

@@ -17,7 +17,7 @@ from .controller import Decision, as_one_row, as_rows, first_non_finite, raise_n
 from .disturbance import ESTIMATOR_SIZE
 from .fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXED_WEIGHT
 from .model import hover_pair
-from .mpc_kernels import MpcData, Scratch, begin_row, buffer_size, carve, end_row
+from .mpc_kernels import MpcData, Scratch, begin_row, buffer_size, carve, end_row, rotor_lag
 from .ocp import IntArray, OcpQp, StateRows, no_rows, output_rows
 from .riccati import dare
 from .solvers import Backend, Status, StructuredSolver
@@ -127,6 +127,7 @@ def mpc_data(task: BaseTask, horizon: int, options: MpcOptions) -> MpcData:
         dt=float(task.dt),
         force_max=task.force_max,
         rate_step=float(task.limits.rate * task.dt),
+        lag=rotor_lag(task),
         gain=float(options.estimator_gain) if options.reject_disturbance else 0.0,
         heading=options.frame == "heading",
         attitude=options.frame == "heading" and options.velocity_reference == "attitude",

@@ -18,7 +18,7 @@ from .fallback import CLIPPED_SDRE, HOVER, NONE, limit_command
 from .linalg import copy
 from .model import hover_pair, sdc_matrix, sdc_pair, zero_order_hold
 from .mpc import Frame, VelocityReference, require_choice
-from .mpc_kernels import copy_vector, set_references, set_state
+from .mpc_kernels import add_rotor_lag, copy_vector, rotor_lag, set_references, set_state
 from .ocp import IntArray, OcpQp, no_rows
 from .riccati import DARE_SCRATCH, dare, lqr_gain, solve_dare, stage_gains
 
@@ -73,6 +73,7 @@ def _decide_rows(
     dt: float,
     force_max: Array,
     rate_step: float,
+    lag: float,
     scratch: Array,
 ) -> int:
     """One decision per row; alpha < 0: the gain K_0 everywhere."""
@@ -86,6 +87,7 @@ def _decide_rows(
     for j in range(plants.shape[0]):
         feed_forward(disturbances[j], plants[j, 8], c, force_max, offset, trim)
         set_state(plants[j], heading, x)
+        add_rotor_lag(plants[j], offset, B_c, lag, x)
         set_references(plants[j], windows[j], trim, heading, attitude, r)
         level = NONE
         if alpha < 0.0 or not sdre_gain(x, alpha, c, B_c, Q, R, dt, K, scratch):
@@ -154,6 +156,7 @@ class Sdre(FeedbackLaw):
             float(task.dt),
             task.force_max,
             float(task.limits.rate * task.dt),
+            rotor_lag(task),
         )
         self._scratch = np.empty((_MATRICES + 2, N_STATE, N_STATE))
 
@@ -179,10 +182,11 @@ class Sdre(FeedbackLaw):
         plant_row, rows, last, revealed, _ = as_one_row(
             plant, window, last_command, disturbance, memory, 1, 0
         )
-        alpha, heading, attitude, c, _, Q, R, _, dt, force_max, rate_step = self._constants
+        alpha, heading, attitude, c, B_c, Q, R, _, dt, force_max, rate_step, lag = self._constants
         offset, trim, x, r = np.zeros(N_INPUT), np.zeros(N_STATE), np.zeros(N_STATE), np.zeros((1, N_STATE))
         feed_forward(revealed, plant_row[8], c, force_max, offset, trim)
         set_state(plant_row, heading, x)
+        add_rotor_lag(plant_row, offset, B_c, lag, x)
         set_references(plant_row, rows, trim, heading, attitude, r)
         params = self.task.params
         A, B = hover_pair(params, dt) if alpha < 0.0 else sdc_pair(x, params, dt, alpha)

@@ -2,7 +2,9 @@
 
 The sources are models themselves, with more in them than here: a rotor speed with its own lag (here one rate
 of the force), arms that are not exactly square, drag that differs by axis. What was made of them is said with
-each. Rotors 1 and 3 of a `QuadrotorParams` turn clockwise from above; where those of a vehicle turn the other
+each. The drag here is the same along all axes, as that of the Crazyflie nearly is; RotorS and PX4 have it in the
+plane of the rotors only (0.146 kg/s for the Hummingbird in hover, 0.556 kg/s for the Iris), which is left out: it
+would brake climbs that theirs does not. `drag=` puts it back. Rotors 1 and 3 of a `QuadrotorParams` turn clockwise from above; where those of a vehicle turn the other
 way, it is the mirror image, with the same authority.
 """
 
@@ -72,7 +74,6 @@ VEHICLES: dict[str, Vehicle] = {
             arm=0.247,  # mean of 0.256 in front and 0.239 behind; the real one is wider than long, no square
             yaw_moment=0.06,
             rotor_rate=53.3,  # mean of the time constants 12.5 ms up and 25 ms down
-            drag=0.556,  # 1.75e-4 kg per rotor times its speed in hover, 794 rad/s; there none along z
             frame="x",
         ),
         7.07,  # 5.84e-6 (1100 rad/s)^2
@@ -87,7 +88,6 @@ VEHICLES: dict[str, Vehicle] = {
             arm=0.17,
             yaw_moment=0.016,
             rotor_rate=53.3,  # mean of the time constants 12.5 ms up and 25 ms down
-            drag=0.146,  # 8.06e-5 kg per rotor times its speed in hover, 453 rad/s; there none along z
         ),
         6.0,  # 8.55e-6 (838 rad/s)^2
         "0.72 kg, plus frame, AscTec Hummingbird",
