@@ -57,7 +57,7 @@ def _axis(x: float, y: float, dx: float, dy: float, name: str) -> str:
     return (
         _line(x, y, tip_x, tip_y, _PALE, 2)
         + f'<polygon points="{tip_x:.1f},{tip_y:.1f} {left} {right}" fill="{_PALE}"/>'
-        + _text(tip_x + 0.12 * dx + 10.0 * (dx > 0.0), tip_y + 0.06 * dy + 5.0 * (dx > 0.0), name, 13)
+        + _text(tip_x + 12.0 * (dx > 0.0), tip_y + 0.05 * dy + 5.0 * (dx > 0.0), name, 13)
     )
 
 
@@ -88,7 +88,7 @@ def drawing() -> str:
     """The picture as SVG."""
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {2 * _WIDTH} {_HEIGHT + 50}" '
-        'font-family="sans-serif" role="img" aria-label="Rotor order, spin and arms of the plus and X frames">',
+        'font-family="sans-serif" role="img" aria-label="Rotor order, spin and arms of both frames">',
         f'<rect width="{2 * _WIDTH}" height="{_HEIGHT + 50}" fill="white"/>',
     ]
     for column, name in enumerate(FRAMES):

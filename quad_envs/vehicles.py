@@ -1,11 +1,14 @@
 """Vehicles by name: published parameters, each with its source.
 
-The sources are models themselves, with more in them than here: a rotor speed with its own lag (here one rate
-of the force), arms that are not exactly square, drag that differs by axis. What was made of them is said with
-each. The drag here is the same along all axes, as that of the Crazyflie nearly is; RotorS and PX4 have it in the
-plane of the rotors only (0.146 kg/s for the Hummingbird in hover, 0.556 kg/s for the Iris), which is left out: it
-would brake climbs that theirs does not. `drag=` puts it back. Rotors 1 and 3 of a `QuadrotorParams` turn clockwise from above; where those of a vehicle turn the other
-way, it is the mirror image, with the same authority.
+The sources are models with more in them than here: a rotor speed with its own lag (here one rate of force),
+arms that are not exactly square, drag that differs by axis. What was made of them is said with each.
+
+Drag here is the same along all axes, as that of the Crazyflie nearly is. RotorS and PX4 have it in the plane
+of the rotors only (in hover 0.146 kg/s for the Hummingbird, 0.556 kg/s for the Iris); it is left out, as it
+would also brake climbs, which theirs does not. `drag=` puts it back.
+
+Rotors 1 and 3 of a `QuadrotorParams` turn clockwise from above. Where those of a vehicle turn the other way,
+it is the mirror image, with the same authority.
 """
 
 from __future__ import annotations

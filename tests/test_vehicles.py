@@ -1,6 +1,8 @@
 """Vehicles by name, and what a user may change about them."""
 
+import importlib.util
 import json
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -111,3 +113,22 @@ def test_the_crazyflies_slow_rotors_lose_nobody_on_the_helix(policy, least):
     found = evaluate(make_policy(policy, env), env, episodes=4, seed=0)
     assert not any(record.crashed for record in found.records)
     assert np.mean([record.score for record in found.records]) > least
+
+
+def test_the_drawn_airframes_are_those_of_the_parameters():
+    docs = Path(__file__).parents[1] / "docs"
+    spec = importlib.util.spec_from_file_location("airframes", docs / "airframes.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    drawn = (docs / "airframes.svg").read_text(encoding="utf-8")
+    assert drawn == module.drawing(), "run python docs/airframes.py"
+
+
+def test_the_distances_of_a_team_follow_the_arm_where_they_are_not_given():
+    for name, vehicle in VEHICLES.items():
+        task = formation_v0.parallel_env(vehicle=name, vehicles=3).unwrapped.task
+        assert task.crash_distance == pytest.approx(2.0 * vehicle.params.arm)
+        assert task.separation == pytest.approx(max(0.4, 2.0 * vehicle.params.arm + 0.07))
+    task = formation_v0.parallel_env(vehicle="iris", vehicles=3, crash_distance=0.3).unwrapped.task
+    assert task.crash_distance == 0.3
+    assert formation_v0.parallel_env(vehicles=3).unwrapped.task.separation == 0.4

@@ -49,7 +49,8 @@ class FormationEnv(TeamEnv):
     Vehicle, limits, weights, uncertainty, `dt`, `substeps`, `reward`: see `TrackingEnv`; `tilt_limit` 1.2.
     Team: `vehicles` 6 (2 to 200), `formation` "lattice", "triangle", "hexagon" or (N, 3) offsets, `spacing`
         1 m, `start` "random", "line", "sorted", "box" or (N, 3), `separation` d_s 0.4 m, `crash_distance`
-        0.33 m, `sensing_radius` 2 m, `sensed` slots, `terminate` "team" or "agent", `arena` 100 m.
+        0.33 m (both follow another arm: 2 arm, and 0.07 m more but at least 0.4), `sensing_radius` 2 m,
+        `sensed` slots, `terminate` "team" or "agent", `arena` 100 m.
     Communication: `graph` "weak", "strong", "chain", "ring", "star", "complete", "switching", a matrix (row i
         is what i hears), a `Switching` or `Timed` schedule or a function of the step; `leader_weight` 10 of
         a link toward the leader where weights are 1, `drop_out` probability, `delay` steps,

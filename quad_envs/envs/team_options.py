@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, Literal, get_args
 
@@ -20,7 +21,7 @@ from ..graphs import (
     make_graph_table,
     toward_leader,
 )
-from ..parameters import Array
+from ..parameters import Array, QuadrotorParams
 from ..references import Reference, make_reference
 from ..sensors import sensor_rows
 from ..targets import Target, make_target
@@ -40,6 +41,8 @@ CHAPTER_7_SLOTS = (
 )
 CHAPTER_6_RAILS = ((0.0, 0.0, 0.0), (4.0, 0.0, -1.0), (0.0, 4.0, 1.0), (4.0, 4.0, -2.0))
 _STAGGER = 0.4  # m, up and down in turn: a plane of vehicles cannot tell the target from its mirror image
+_SEPARATION = 0.4  # m
+_BESIDE = 0.07  # m, by which the separation exceeds the distance of a crash, as by default
 _BEHIND = (-1.0, 0.0, 0.0)  # m, of a named formation relative to the target
 
 Comm = Literal["state", "plan"]
@@ -67,7 +70,7 @@ class TeamOptions(VehicleOptions):
     message_lifetime: float = 2.0
     comm: Comm = "state"
     start: str | _Rows = "random"
-    separation: float = 0.4
+    separation: float = _SEPARATION
     crash_distance: float = 0.33
     sensing_radius: float = 2.0
     neighbours: int | None = None
@@ -111,6 +114,14 @@ class TeamOptions(VehicleOptions):
         object.__setattr__(self, "graphs", self._make_graphs())
         object.__setattr__(self, "task", self._make_task())
         self.check_start()
+
+    @classmethod
+    def that_follow(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Of vehicles with another arm: a crash where tips meet, and a separation that exceeds it."""
+        arm = values.get("arm", QuadrotorParams().arm)
+        if not is_number(arm) or arm == QuadrotorParams().arm:
+            return {}
+        return {"crash_distance": 2.0 * arm, "separation": max(_SEPARATION, 2.0 * arm + _BESIDE)}
 
     def check_start(self) -> None:
         """Refuse a start that cannot be flown.

@@ -138,7 +138,13 @@ class VehicleOptions:
                 hint = suggestion(name, known)
                 raise TypeError(f"unexpected keyword argument {name!r} of {cls.kind} environment; {hint}")
         named = vehicle_values(kwargs["vehicle"]) if "vehicle" in kwargs else {}
-        return cls(**named | {name: _as_tuple(value) for name, value in kwargs.items()})
+        values = named | {name: _as_tuple(value) for name, value in kwargs.items()}
+        return cls(**cls.that_follow(values) | values)
+
+    @classmethod
+    def that_follow(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Defaults that follow from other values; here none do."""
+        return {}
 
     @property
     def episode_steps(self) -> int:
