@@ -10,7 +10,7 @@ from quad_envs.observations import N_REFERENCE
 from quad_envs.parameters import N_STATE, Array
 from quad_envs.rotations import sincos
 
-from .collision import AvoidanceData, separation_rows
+from .collision import COLLISION_SCRATCH, AvoidanceData, separation_rows
 from .consensus_kernels import ConsensusData, consensus_row, inertial_velocity, turn_to_inertial
 from .controller import all_finite
 from .fallback import HOVER, PREVIOUS_PLAN
@@ -32,6 +32,7 @@ class RowLayout(NamedTuple):
     """What the kernels take besides the options of the parts."""
 
     alpha: float
+    turning: float  # alpha, or 0 where positions are predicted as the dissertation does
     stage_weight: bool  # Q_f = Q
     limits: int  # outputs with limits; the normals of the separation rows follow
     limit_rows: int
@@ -61,6 +62,38 @@ def level_weight(x_0: Array, P: Array, out: Array) -> None:
         u, v, w = out[k, 3], out[k, 4], out[k, 5]
         down = st * u + ct * w
         out[k, 3], out[k, 4], out[k, 5] = ct * u - st * w, sf * down + cf * v, cf * down - sf * v
+
+
+@kernel
+def turning_velocity(x_0: Array, alpha: float, D: Array) -> None:
+    """D (3, 3), alpha times the derivative of the inertial velocity R_BI(Theta)' V_B by Theta, at psi = 0.
+
+    The model turns V_B with the predicted attitude (the share alpha of -Omega x V_B reads predicted rates),
+    but takes it back with the present R_BI': a climbing vehicle that rolls would seem to move sideways, away
+    from the side to which its thrust will push it. D (Theta - Theta_k) undoes that.
+    """
+    sf, cf = sincos(x_0[6])
+    st, ct = sincos(x_0[7])
+    u, v, w = x_0[3], x_0[4], x_0[5]
+    side, under = cf * v - sf * w, sf * v + cf * w  # of R_x(phi)' V_B
+    forward = ct * u + st * under
+    D[0, 0], D[1, 0], D[2, 0] = alpha * st * side, -alpha * under, alpha * ct * side
+    D[0, 1], D[1, 1], D[2, 1] = alpha * (ct * under - st * u), 0.0, -alpha * forward
+    D[0, 2], D[1, 2], D[2, 2] = -alpha * side, alpha * forward, 0.0
+
+
+@kernel
+def hold_attitude(x_0: Array, D: Array, dt: float, c: Array) -> None:
+    """Complete c (N, 12) where p' has D Theta: its rate is D (Theta - Theta_k), also about the equilibrium.
+
+    dt times the rate is exact, because no state's rate depends on the position.
+    """
+    for a in range(3):
+        rate = 0.0
+        for b in range(3):
+            rate -= D[a, b] * x_0[6 + b]
+        for i in range(c.shape[0]):
+            c[i, a] += dt * rate
 
 
 @kernel
@@ -104,9 +137,15 @@ def pose_row(
     for n in range(N + 1):
         for a in range(2):
             s.r[n, 6 + a] += attitude[n, a]
+    D = free[9 + COLLISION_SCRATCH : 18 + COLLISION_SCRATCH].reshape(3, 3)
+    turning_velocity(s.x_0, layout.turning, D)
     sdc_matrix(s.x_0, layout.alpha, data.coefficients, s.A_c)
+    for a in range(3):
+        for b in range(3):
+            s.A_c[a, 6 + b] += D[a, b]
     zero_order_hold(s.A_c, data.B_c, data.dt, s.A[0], s.B[0], s.square)
     hold_trim(s.A, s.trim, s.c)
+    hold_attitude(s.x_0, D, data.dt, s.c)
     if layout.stage_weight:
         copy(data.Q[0], s.P)
     else:
@@ -115,7 +154,7 @@ def pose_row(
     v, other, rest = free[:3], free[3:9], free[9:]
     v[0], v[1], v[2] = inertial_velocity(plant)
     used = separation_rows(
-        plant, v, comm, sensed, plan if memory[0] > 0.0 else plan[:0], N, avoidance,
+        plant, v, comm, sensed, plan if memory[0] > 0.0 else plan[:0], N, avoidance, D,
         s.normals[layout.limits :], s.row_lower[layout.limit_rows :], other, rest,
     )  # fmt: skip
     return layout.limits + layout.slot_normals * used, layout.limit_rows + layout.slot_rows * used

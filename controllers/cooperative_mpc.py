@@ -11,6 +11,7 @@ the estimator's numbers, then the planned positions and velocities (N x 6).
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from quad_envs.observations import N_REFERENCE
 from quad_envs.parameters import N_INPUT, Array
 from quad_envs.tasks import TeamTask
 
-from .collision import COLLISION_SCRATCH, AvoidanceOptions, AvoidanceRule, AvoidanceSet
+from .collision import COLLISION_SCRATCH, AvoidanceOptions, AvoidanceRule, AvoidanceSet, time_to_stop
 from .consensus import ConsensusOptions, Neighbour, TargetModel, require_messages
 from .consensus_kernels import CONSENSUS_SCRATCH
 from .controller import PLANT_SIZE, as_array
@@ -73,9 +74,15 @@ class CooperativeMpc:
         avoidance: "reciprocal", "frozen" (the dissertation's, its sign corrected), "plan" or "none".
         avoidance_set: Whom to avoid, "sensed" or "edges".
         moving_centre: Whether the common centre of a pair moves with it.
-        braking_time: t_b, s; 0 for no braking row.
+        braking_time: t_b, s; 0 for no braking row, None for the time in which 4 m/s^2 stop a vehicle at the
+            governor's `speed`, or at 2 m/s where that is inf.
         swirl: Turn of the normals about the vertical, rad.
         separation_weight: Penalty per metre of a separation row; `collision.py` says why not more.
+        separation_margin: What the plan keeps beyond the separation, m.
+        plan_tilt: Largest roll and pitch of a plan, rad, besides the task's limit; inf for none. Rows that
+            push a vehicle upside down push it to where its model holds no longer.
+        turning: Whether predicted positions follow the velocity as the predicted attitude turns it; the
+            dissertation's keep the present R_BI.
         soft_weight: Exact penalty per unit of the other state rows; inf makes them hard.
         margin: What the plan keeps from each limit of the task, in its SI unit.
         reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
@@ -103,9 +110,12 @@ class CooperativeMpc:
         avoidance: AvoidanceRule = "reciprocal",
         avoidance_set: AvoidanceSet = "sensed",
         moving_centre: bool = True,
-        braking_time: float = 0.25,
+        braking_time: float | None = None,
         swirl: float = math.radians(5.0),
         separation_weight: float = 1e3,
+        separation_margin: float = 0.03,
+        plan_tilt: float = 0.7,
+        turning: bool = True,
         soft_weight: float = 1e3,
         margin: float = 0.02,
         reject_disturbance: bool = False,
@@ -117,12 +127,16 @@ class CooperativeMpc:
         if not 0.0 <= alpha <= 1.0:
             raise ValueError(f"alpha must lie in [0, 1], got {alpha!r}; 1/2 is the dissertation's")
         require_choice("terminal_weight", terminal_weight, CooperativeTerminalWeight)
+        if not plan_tilt > 0.0:
+            raise ValueError(f"plan_tilt must be > 0 rad, got {plan_tilt!r}; math.inf is no limit")
         self.task, self.horizon = task, int(horizon)
         self.consensus = ConsensusOptions(
             neighbour, feed_forward, attitude, reach, speed, formation_weight, target
         )
+        if braking_time is None:
+            braking_time = time_to_stop(speed)
         self.avoidance = AvoidanceOptions(
-            avoidance, avoidance_set, moving_centre, braking_time, swirl, separation_weight
+            avoidance, avoidance_set, moving_centre, braking_time, swirl, separation_weight, separation_margin
         )
         self.options = MpcOptions(
             "structured", "heading", "attitude", soft_weight, margin, reject_disturbance, estimator_gain,
@@ -130,15 +144,17 @@ class CooperativeMpc:
         )  # fmt: skip
         require_messages(task.layout.comm_size, self.consensus)
         self.avoidance.require_plans(task.layout.plan)
-        self._prepare(float(alpha), terminal_weight == "stage")
+        self._prepare(float(alpha), terminal_weight == "stage", float(plan_tilt), bool(turning))
         estimator = ESTIMATOR_SIZE if reject_disturbance else 0
         self.memory_size = 1 + (N_INPUT + N_PLAN_STAGE) * self.horizon + estimator
         self._workspace: tuple[Any, ...] | None = None
 
-    def _prepare(self, alpha: float, stage_weight: bool) -> None:
+    def _prepare(self, alpha: float, stage_weight: bool, plan_tilt: float, turning: bool) -> None:
         """Constants for the kernels: the rows of the limits, then those of every slot."""
         task, edges = self.task, self.avoidance.neighbours == "edges"
-        data = mpc_data(task, self.horizon, self.options)
+        tilt = min(task.limits.tilt, plan_tilt + self.options.margin)
+        planned = replace(task, limits=replace(task.limits, tilt=tilt))
+        data = mpc_data(planned, self.horizon, self.options)
         slots = task.layout.neighbours if edges else task.layout.sensed
         limits = StateRows(data.normals, data.normal, data.stage, data.lower, data.upper, data.weight)
         separation = self.avoidance.layout(slots, self.horizon)
@@ -146,7 +162,7 @@ class CooperativeMpc:
         axis = np.concatenate([data.axis, np.full(len(separation.normals), -1)])
         self._data = data._replace(**rows._asdict(), axis=axis)
         self._layout = RowLayout(
-            alpha, stage_weight, len(limits.normals), len(limits.normal),
+            alpha, alpha if turning else 0.0, stage_weight, len(limits.normals), len(limits.normal),
             len(separation.normals) // max(slots, 1), len(separation.normal) // max(slots, 1),
             task.layout.comm_size, 1,
         )  # fmt: skip
@@ -281,7 +297,7 @@ class CooperativeMpc:
             self._workspace = (
                 np.zeros(1, np.int64) if self.options.reject_disturbance else None,
                 np.zeros(buffer_size(N, 1, len(data.normals), len(data.normal), 0)),
-                np.zeros((N_REFERENCE + 2) * (N + 1) + max(CONSENSUS_SCRATCH, 9 + COLLISION_SCRATCH)),
+                np.zeros((N_REFERENCE + 2) * (N + 1) + max(CONSENSUS_SCRATCH, 18 + COLLISION_SCRATCH)),
                 make_workspace(N, len(data.normal), 1),
             )
         return self._workspace

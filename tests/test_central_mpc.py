@@ -66,7 +66,7 @@ def test_far_from_each_other_vehicles_decide_as_leaders_do(limits):
     plants[:, 6:8] *= 0.3
     plants[:, 8] = [0.2, -2.5, 3.1]
     slots = plants[:, :3] + 2.0 * rng.normal(size=(3, 3))
-    free = CooperativeMpc(task, reach=np.inf, speed=np.inf)
+    free = CooperativeMpc(task, reach=np.inf, speed=np.inf, turning=False, plan_tilt=np.inf)
     preview = np.repeat(rows_of(line)[None], 3, axis=0)
     preview[..., :3] += (slots - plants[:, :3])[:, None]
     expected = decide(free, plants, np.eye(3), slots, preview=preview, leader=np.ones(3))

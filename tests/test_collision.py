@@ -12,7 +12,7 @@ from controllers.collision import COLLISION_SCRATCH, AvoidanceOptions, separatio
 from quad_envs.rotations import rotation_body_from_inertial
 
 N, DT, D_S, R_S = 5, 0.05, 0.4, 2.0
-NOBODY, NO_PLAN = np.zeros((0, 15)), np.zeros(0)
+NOBODY, NO_PLAN, NO_TURN = np.zeros((0, 15)), np.zeros(0), np.zeros((3, 3))
 
 
 def some_team(rng, n=4, spread=0.5):
@@ -26,13 +26,13 @@ def some_team(rng, n=4, spread=0.5):
 class Rows:
     """The rows of one vehicle, evaluated on inertial predictions."""
 
-    def __init__(self, options, plant, v, comm=NOBODY, sensed=NOBODY[:, :7], own=NO_PLAN):
+    def __init__(self, options, plant, v, comm=NOBODY, sensed=NOBODY[:, :7], own=NO_PLAN, D=NO_TURN):
         slots = len(comm) if options.neighbours == "edges" else len(sensed)
         layout = options.layout(slots, N)
         self.normals, self.lower = np.zeros_like(layout.normals), layout.lower.copy()
         arguments = np.ascontiguousarray(comm), np.ascontiguousarray(sensed), own, N
         self.used = separation_rows(
-            plant, v, *arguments, options.data(D_S, R_S, DT), self.normals, self.lower, np.zeros(6),
+            plant, v, *arguments, options.data(D_S, R_S, DT), D, self.normals, self.lower, np.zeros(6),
             np.zeros(COLLISION_SCRATCH),
         )  # fmt: skip
         self.normal, self.stage = layout.normal, layout.stage
@@ -58,17 +58,17 @@ def test_rows_are_those_of_the_equations(moving, braking):
     task, plants = some_team(rng)
     v, sensed = velocities(plants), sensed_rows(plants, task)
     rows, (p, w) = Rows(options, plants[0], v[0], sensed=sensed[0]), predictions(rng)
-    expected, swirl = [], math.radians(5)
+    expected, swirl, kept = [], math.radians(5), (D_S + options.margin) / 2
     turn = np.array([[np.cos(swirl), -np.sin(swirl), 0], [np.sin(swirl), np.cos(swirl), 0], [0, 0, 1]])
     for row in sensed[0][: rows.used]:
         p_j, v_j = row[1:4], row[4:7] + v[0]
         a = turn @ -p_j / np.linalg.norm(p_j)
         for n in range(1, N + 1):
             centre = p_j / 2 + n * DT * (v[0] + v_j) / 2 * moving
-            expected.append(a @ p[n] - a @ centre - D_S / 2)
+            expected.append(a @ p[n] - a @ centre - kept)
         if braking:
             centre = p_j / 2 + (N * DT + braking) * (v[0] + v_j) / 2 * moving
-            expected.append(a @ (p[N] + braking * w[N]) - a @ centre - D_S / 2)
+            expected.append(a @ (p[N] + braking * w[N]) - a @ centre - kept)
     assert rows.used == 3
     np.testing.assert_allclose(rows.slack(p, w), expected, atol=1e-12)
 
@@ -86,7 +86,9 @@ def test_the_rows_of_a_pair_add_up_to_the_separation():
         a = rotation_body_from_inertial([0, 0, -options.swirl]) @ d / np.linalg.norm(d)
         apart = (plans[0][0] + plants[0, :3]) - (plans[1][0] + plants[1, :3])
         closing = plans[0][1][N] - plans[1][1][N]
-        expected = np.append(apart[1:] @ a, a @ (apart[N] + 0.25 * closing)) - D_S
+        expected = (
+            np.append(apart[1:] @ a, a @ (apart[N] + options.braking_time * closing)) - D_S - options.margin
+        )
         np.testing.assert_allclose(slack, expected, atol=1e-12)
 
 
