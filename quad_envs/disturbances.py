@@ -105,6 +105,7 @@ class Steady:
 _TORQUE_SHARES = np.array(
     [0.03, 0.03, 0.1]
 )  # roll, pitch, yaw: yaw is weak, and propellers turn with the wind
+_ANGULAR_ACCELERATION = 1.0  # rad/s^2: a light vehicle has more authority than a control period can use
 _FORCE_SHARE = 0.25  # and not above
 _FORCE_OF_WEIGHT = 1.0 / 16.0  # 0.49 N of the default vehicle
 
@@ -114,8 +115,8 @@ class Gusts:
     """Force and torque as first-order Gauss-Markov processes: turbulence with a correlation time.
 
     What is None follows the vehicle: a force of 1/16 of its weight (at most a quarter of what it can hold)
-    and torques of 3, 3 and 10 % of what its rotors can hold about roll, pitch and yaw in hover. That is
-    0.49 N and (0.019, 0.019, 0.0017) N m for the default vehicle.
+    and torques of 3, 3 and 10 % of what its rotors can hold about roll, pitch and yaw in hover, at most
+    1 rad/s^2. That is 0.49 N and (0.019, 0.019, 0.0017) N m for the default vehicle.
 
     Raises:
         ValueError: If a deviation is negative or the correlation time is not positive.
@@ -142,7 +143,8 @@ class Gusts:
         """These gusts with the deviations that are None in numbers of a vehicle."""
         authority = hover_authority(params, limits)
         force = min(_FORCE_OF_WEIGHT * params.weight, _FORCE_SHARE * float(authority[3:].min()))
-        x, y, z = (_TORQUE_SHARES * authority[:3]).tolist()
+        most = _ANGULAR_ACCELERATION * np.array(params.inertia)
+        x, y, z = np.minimum(_TORQUE_SHARES * authority[:3], most).tolist()
         return replace(
             self,
             force=force if self.force is None else self.force,

@@ -116,6 +116,7 @@ def test_the_authority_is_where_the_first_rotor_in_equilibrium_meets_its_limit(p
 @pytest.mark.parametrize(("params", "limits"), VEHICLES.values(), ids=VEHICLES)
 def test_gusts_without_numbers_are_within_what_the_vehicle_holds(params, limits):
     share = disturbance_of("gusts", params, limits).size() / hover_authority(params, limits)
+    assert (disturbance_of("gusts", params, limits).size()[:3] <= np.array(params.inertia) * 1.001).all()
     # the share of yaw is 10 %, of each force at most 25 %: four standard deviations are within the authority
     assert share[2] <= 0.1 + 1e-12 and (share <= 0.25 + 1e-12).all() and (share > 0.0).all()
     assert beyond_authority(disturbance_of("gusts", params, limits), params, limits) == ""
