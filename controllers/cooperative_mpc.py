@@ -29,7 +29,7 @@ from .controller import PLANT_SIZE, as_array
 from .cooperative_kernels import NAMES, RowLayout, Team, decide_team, pose_row
 from .disturbance import ESTIMATOR_GAIN, ESTIMATOR_SIZE, N_DISTURBANCE
 from .mpc import MpcOptions, mpc_data, require_choice
-from .mpc_kernels import buffer_size, carve
+from .mpc_kernels import MEMORY_STAGE, buffer_size, carve
 from .ocp import IntArray, OcpQp, StateRows, concatenate_rows
 from .solvers.structured import ITERATION_LIMIT, make_workspace
 
@@ -87,7 +87,7 @@ class CooperativeMpc:
         margin: What the plan keeps from each limit of the task, in its SI unit.
         reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
         estimator_gain: Share of each new residual in the estimate, in (0, 1].
-        iteration_limit: Largest number of active-set steps of a solve.
+        iteration_limit: Largest number of active-set steps of a solve; 0 for one that grows with it.
 
     Raises:
         ValueError: If an option is not allowed.
@@ -146,7 +146,7 @@ class CooperativeMpc:
         self.avoidance.require_plans(task.layout.plan)
         self._prepare(float(alpha), terminal_weight == "stage", float(plan_tilt), bool(turning))
         estimator = ESTIMATOR_SIZE if reject_disturbance else 0
-        self.memory_size = 1 + (N_INPUT + N_PLAN_STAGE) * self.horizon + estimator
+        self.memory_size = 1 + (MEMORY_STAGE + N_PLAN_STAGE) * self.horizon + estimator
         self._workspace: tuple[Any, ...] | None = None
 
     def _prepare(self, alpha: float, stage_weight: bool, plan_tilt: float, turning: bool) -> None:

@@ -17,7 +17,16 @@ from .controller import Decision, as_one_row, as_rows, first_non_finite, raise_n
 from .disturbance import ESTIMATOR_SIZE
 from .fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXED_WEIGHT
 from .model import hover_pair
-from .mpc_kernels import MpcData, Scratch, begin_row, buffer_size, carve, end_row, rotor_lag
+from .mpc_kernels import (
+    MEMORY_STAGE,
+    MpcData,
+    Scratch,
+    begin_row,
+    buffer_size,
+    carve,
+    end_row,
+    rotor_lag,
+)
 from .ocp import IntArray, OcpQp, StateRows, no_rows, output_rows
 from .riccati import dare
 from .solvers import Backend, Status, StructuredSolver
@@ -67,8 +76,11 @@ class MpcOptions:
             )
         if not 0.0 < self.estimator_gain <= 1.0:
             raise ValueError(f"estimator_gain must lie in (0, 1], got {self.estimator_gain!r}")
-        if self.iteration_limit < 1:
-            raise ValueError(f"iteration_limit must be at least 1, got {self.iteration_limit!r}")
+        if self.iteration_limit < 0:
+            raise ValueError(
+                "iteration_limit must be at least 1, or 0 for one that grows with the problem, "
+                f"got {self.iteration_limit!r}"
+            )
 
 
 class Problem(NamedTuple):
@@ -150,7 +162,9 @@ class Mpc(ABC):
         self._data = mpc_data(task, self.horizon, options)
         self._pairs = pairs
         self._guess_stages = self.horizon if guess else 0
-        self._keep_from = 1 + N_INPUT * self.horizon + (ESTIMATOR_SIZE if options.reject_disturbance else 0)
+        self._keep_from = (
+            1 + MEMORY_STAGE * self.horizon + (ESTIMATOR_SIZE if options.reject_disturbance else 0)
+        )
         self.memory_size = self._keep_from + (1 + N_STATE * (self.horizon + 1) if guess else 0)
         self._workspace: tuple[IntArray | None, Array, Workspace] | None = None
         self._backend: Backend | None = None
@@ -273,7 +287,7 @@ class Mpc(ABC):
         if self._backend is None:
             from .solvers.osqp import OsqpSolver
 
-            self._backend = OsqpSolver()
+            self._backend = OsqpSolver(persistent=False)  # rows must not depend on each other
         qp = self._as_qp(problem, s)
         solution = self._backend.solve(qp)
         iterations = solution.iterations

@@ -2,8 +2,8 @@
 
 The flavours (`lmpc.py`, `sdc_nmpc.py`, `nmpc.py`) add how the pairs (A_i, B_i) and affine terms c_i are made.
 
-Memory of one vehicle: whether a plan is held, the plan's rotor commands (N x 4), then, with
-`reject_disturbance`, the estimator's ESTIMATOR_SIZE numbers, then what the flavour keeps.
+Memory of one vehicle: whether a plan is held, the plan's rotor commands (N x 4), the solver's working set
+(N), then, with `reject_disturbance`, the estimator's ESTIMATOR_SIZE numbers, then what the flavour keeps.
 """
 
 from __future__ import annotations
@@ -23,6 +23,9 @@ from .ocp import IntArray
 from .riccati import DARE_SCRATCH
 from .solvers.active_set import INFEASIBLE, OPTIMAL
 from .solvers.structured import Workspace, solve_structured
+from .solvers.working_set import pack_working_set, unpack_working_set
+
+MEMORY_STAGE = N_INPUT + 1  # numbers that a plan and its working set take per stage
 
 
 class MpcData(NamedTuple):
@@ -73,6 +76,7 @@ class Scratch(NamedTuple):
     P: Array  # (12, 12)
     square: Array  # (DARE_SCRATCH, 12, 12)
     work: Array  # (ESTIMATOR_SCRATCH,)
+    working: Array  # (N,), working set of the solver, one number per stage
     Q: Array  # (M, 12, 12), stage weights; M = N where a guess is kept, else 0
     target: Array  # (M+1, 12), references that go with them
     X: Array  # (M+1, 12), guess of the states
@@ -84,7 +88,7 @@ def buffer_size(N: int, pairs: int, H: int, K: int, M: int) -> int:
     n, m = N_STATE, N_INPUT
     vectors = 2 * n + 4 * m + 2 * N_DISTURBANCE + ESTIMATOR_SCRATCH
     stages = n * (2 * N + 1) + pairs * n * (n + m) + n * H + 3 * K
-    return vectors + stages + (2 + DARE_SCRATCH) * n * n + M * n * n + 2 * n * (M + 1) + m * M
+    return vectors + N + stages + (2 + DARE_SCRATCH) * n * n + M * n * n + 2 * n * (M + 1) + m * M
 
 
 @kernel
@@ -106,6 +110,8 @@ def carve(buffer: Array, N: int, pairs: int, H: int, K: int, M: int) -> Scratch:
     n, m, e = N_STATE, N_INPUT, N_DISTURBANCE
     v = _take(buffer, 0, 1, 2 * n + 4 * m + 2 * e + ESTIMATOR_SCRATCH)[0]
     i = v.shape[0]
+    working = _take(buffer, i, 1, N)[0]
+    i += N
     r = _take(buffer, i, N + 1, n)
     i += r.size
     c = _take(buffer, i, N, n)
@@ -131,7 +137,7 @@ def carve(buffer: Array, N: int, pairs: int, H: int, K: int, M: int) -> Scratch:
         v[:n], v[n : 2 * n], v[2 * n : 2 * n + m], v[2 * n + m : 2 * n + 2 * m],
         v[2 * n + 2 * m : 2 * n + 3 * m], v[2 * n + 3 * m : o], v[o : o + e], v[o + e : o + 2 * e],
         r, c, A, B, normals, rows[0], rows[1], rows[2], square[0], square[1], square[2:], v[o + 2 * e :],
-        Q, target, X, F,
+        working, Q, target, X, F,
     )  # fmt: skip
 
 
@@ -266,10 +272,14 @@ def begin_row(
 
     Without an estimator `which` is None, and its code is not even compiled; else zeros, (1,).
     """
+    N = s.c.shape[0]
+    working = memory[1 + N_INPUT * N : 1 + MEMORY_STAGE * N]
+    for i in range(N):
+        s.working[i] = working[min(i + 1, N - 1)]
     for i in range(N_DISTURBANCE):
         s.estimate[i] = 0.0
     if which is not None:
-        kept = memory[1 + N_INPUT * s.c.shape[0] :]
+        kept = memory[1 + MEMORY_STAGE * N :]
         update_estimate(
             plant, kept, data.gain, data.coefficients, data.dt, data.force_max, s.estimate, s.work, which
         )
@@ -335,7 +345,7 @@ def solve_row(
     """Solve; hard rows that contradict each other become soft; failing that, without a plan, no constraints.
 
     Only the first H normals and K rows count: where their number differs from vehicle to vehicle, the others
-    are left out.
+    are left out. The solver starts from the working set in s.working and leaves its own there.
 
     Returns:
         Fallback (PREVIOUS_PLAN and HOVER leave no plan in ws.u), and active-set iterations.
@@ -343,14 +353,19 @@ def solve_row(
     level = NONE
     iterations = 0
     rate_step = data.rate_step
+    stage, n_rows = data.stage[:K], 4 * ws.u.size + 2 * K
+    warm = unpack_working_set(s.working, stage, ws.active, ws.guess[:n_rows])
+    for i in range(s.working.shape[0]):
+        s.working[i] = 0.0
     while True:
         status, count = solve_structured(
             A, B, s.c, Q, data.R, Q_f, stationary, s.x_0, r, s.lower, s.upper, rate_step, s.u_last,
-            s.normals[:H], data.normal[:K], data.stage[:K], s.row_lower[:K], s.row_upper[:K], s.weight[:K],
-            data.iteration_limit, ws,
+            s.normals[:H], data.normal[:K], stage, s.row_lower[:K], s.row_upper[:K], s.weight[:K],
+            data.iteration_limit, warm, ws,
         )  # fmt: skip
         iterations += count
         if status == OPTIMAL:
+            pack_working_set(ws.state[:n_rows], stage, ws.active, s.working)
             return level, iterations
         if level == CLIPPED_SDRE:
             return HOVER, iterations
@@ -362,6 +377,7 @@ def solve_row(
             return PREVIOUS_PLAN, iterations
         else:
             level = CLIPPED_SDRE
+            warm = False
             rate_step = math.inf
             _widen(s.lower, s.upper)
             _widen(s.row_lower, s.row_upper)
@@ -392,7 +408,8 @@ def end_row(
                 plan[k] = data.coefficients[HOVER_FORCE]
             else:
                 plan[k] = s.offset[a] + u[i, a]
+        kept[1 + N_INPUT * N + i] = s.working[i]
     kept[0] = 1.0 if level <= PREVIOUS_PLAN else 0.0
     limit_command(plan, last, data.rate_step, data.force_max, command)  # also what a backend leaves over
     if data.gain > 0.0:
-        remember(plant, command, revealed, s.estimate, kept[1 + N_INPUT * N :])
+        remember(plant, command, revealed, s.estimate, kept[1 + MEMORY_STAGE * N :])

@@ -21,6 +21,8 @@ RICCATI_SCRATCH = 6  # (n, n) matrices of scratch that the finite-horizon passes
 _DOUBLING_LIMIT = 40  # 2^40 samples: no stabilisable pair needs more
 _DARE_TOLERANCE = 1e-12  # of the largest entry of P
 _RESIDUAL_TOLERANCE = 1e-8  # of the largest entry of P; stabilisable pairs reach 1e-12
+_NEWTON_ABOVE = 1e-10  # likewise: residual of the doubling from which Newton's method goes on
+_NEWTON_STEPS = 8
 
 
 @kernel
@@ -378,6 +380,8 @@ def dare(A: Array, B: Array, Q: Array, R: Array) -> Array:
         raise ValueError(f"R must be positive definite, its smallest eigenvalue is {smallest}")
     P = np.empty((n, n))
     doublings = solve_dare(A, B, Q, R, P, np.empty((DARE_SCRATCH, n, n)))
+    if doublings > 0:
+        P = _improve(A, B, Q, R, P)
     tolerance = _RESIDUAL_TOLERANCE * max(1.0, float(np.abs(P).max()))
     if doublings < 0 or not _dare_residual(A, B, Q, R, P) <= tolerance:
         moduli = np.abs(np.linalg.eigvals(A))
@@ -385,6 +389,33 @@ def dare(A: Array, B: Array, Q: Array, R: Array) -> Array:
             "the Riccati equation has no stabilising solution: every unstable or marginal mode of A must be "
             f"controllable from B and seen by Q; the eigenvalues of A have moduli {moduli}"
         )
+    return P
+
+
+def _improve(A: Array, B: Array, Q: Array, R: Array, P: Array) -> Array:
+    """Newton's method (Kleinman 1968) from a P that doubling could not find exactly: weights far apart.
+
+    The next P is the cost of the gain of this one, `X = Q + K'R K + A_cl'X A_cl`, summed by doubling: all
+    terms are positive semidefinite, so that nothing cancels, however small R is beside B'P B.
+    """
+    best = _dare_residual(A, B, Q, R, P)
+    for _ in range(_NEWTON_STEPS):
+        if best <= _NEWTON_ABOVE * np.abs(P).max():
+            break
+        K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+        X, F = Q + K.T @ R @ K, A - B @ K
+        for _ in range(_DOUBLING_LIMIT):
+            term = F.T @ X @ F
+            if not np.isfinite(term).all():
+                return P
+            X, F = X + term, F @ F
+            if np.abs(term).max() <= 1e-16 * np.abs(X).max():
+                break
+        X = 0.5 * (X + X.T)
+        residual = _dare_residual(A, B, Q, R, X)
+        if not residual < best:
+            break
+        P, best = X, residual
     return P
 
 

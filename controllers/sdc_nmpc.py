@@ -129,7 +129,7 @@ class SdcNmpc(Mpc):
         margin: What the plan keeps from each state limit, in its SI unit: cover for the unmodelled rotor lag.
         reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
         estimator_gain: Share of each new residual in the estimate, in (0, 1].
-        iteration_limit: Largest number of active-set steps of a solve.
+        iteration_limit: Largest number of active-set steps of a solve; 0 for one that grows with it.
 
     Raises:
         ValueError: If an option is not allowed.

@@ -88,7 +88,7 @@ def test_estimator_finds_a_constant_disturbance_beside_a_revealed_one():
         decision = decide_once(controller, plant, last=last, disturbance=MIXED / 2, memory=memory)
         memory, last = decision.memory[0], decision.command[0]
         plant = held_under(plant, last, TASK, constant(MIXED), k)
-    found = memory[1 + 4 * 25 :][1:7]
+    found = memory[1 + 5 * 25 :][1:7]
     np.testing.assert_allclose(found, MIXED / 2, atol=1e-3)
 
 
@@ -103,7 +103,7 @@ def test_a_jump_of_the_measurement_does_not_tumble_the_vehicle():
     first = decide_once(controller, at_rest())
     plant = at_rest()
     plant[9:12] = 50.0
-    estimate = decide_once(controller, plant, memory=first.memory[0]).memory[0, 1 + 4 * 25 :][1:7]
+    estimate = decide_once(controller, plant, memory=first.memory[0]).memory[0, 1 + 5 * 25 :][1:7]
     assert np.abs(estimate[:3]).max() < 0.2
     assert np.abs(estimate[3:]).max() <= 0.5 * TASK.params.weight
 

@@ -201,7 +201,7 @@ def test_position_box_is_kept_at_any_heading(flavour):
         (lambda: LinearMPC(TASK, velocity_reference="x"), "'heading', 'attitude'"),
         (lambda: LinearMPC(TASK, soft_weight=-1.0), "soft_weight"),
         (lambda: LinearMPC(TASK, estimator_gain=0.0), "estimator_gain"),
-        (lambda: LinearMPC(TASK, iteration_limit=0), "iteration_limit"),
+        (lambda: LinearMPC(TASK, iteration_limit=-1), "iteration_limit"),
         (lambda: LinearMPC(Task(weights=Weights(Q=(1.0, 2.0, *(1.0,) * 10)))), "frame='hover'"),
         (lambda: SdcNmpc(TASK, alpha=1.5), "alpha"),
         (lambda: SdcNmpc(TASK, relinearisations=-1), "relinearisations"),
@@ -224,7 +224,7 @@ def test_bad_arguments_are_named(argument):
         window(rest, 0, N)[None],
         np.full((1, 4), HOVER),
         np.zeros((1, 6)),
-        np.zeros((1, 101)),
+        np.zeros((1, 126)),
     ]
     bad = [a.copy() for a in good]
     bad[argument][..., -1] = np.nan
@@ -245,7 +245,7 @@ def test_arrays_of_any_kind_are_taken():
         [fixed],
         np.full((1, 8), HOVER)[:, ::2],
         np.zeros((1, 6), np.float32),
-        np.zeros((1, 101)),
+        np.zeros((1, 126)),
     )
     np.testing.assert_array_equal(controller.decide(*lists).command, expected)
 

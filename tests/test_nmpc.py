@@ -58,7 +58,7 @@ def test_real_time_iteration_stays_at_the_converged_solution(velocity_error):
     rows[:, :3] -= rows[0, :3] - [0.2, 0.1, -0.2]
     converged = decide_once(ExactNmpc(SLOW, passes=60, velocity_error=velocity_error), STATE, rows)
     memory = converged.memory[0].copy()
-    plan, X = memory[1 : 1 + 4 * N].reshape(N, 4), memory[2 + 4 * N :].reshape(N + 1, 12)
+    plan, X = memory[1 : 1 + 4 * N].reshape(N, 4), memory[2 + 5 * N :].reshape(N + 1, 12)
     plan[1:], X[1:] = plan[:-1].copy(), X[:-1].copy()  # undo the shift that the next decision makes
     again = decide_once(ExactNmpc(SLOW, velocity_error=velocity_error), STATE, rows, memory=memory)
     np.testing.assert_allclose(again.command, converged.command, atol=1e-5)
@@ -99,7 +99,7 @@ def test_guess_survives_a_wrapped_yaw(frame):
     rows = window(helix, 0, N, psi=np.pi - 0.01)
     memory = decide_once(controller, at_rest(Theta=(0, 0, np.pi - 0.02)), rows).memory[0]
     other = memory.copy()
-    other[2 + 4 * N :].reshape(N + 1, 12)[:, 8] -= turn
+    other[2 + 5 * N :].reshape(N + 1, 12)[:, 8] -= turn
     plant = at_rest(Theta=(0, 0, np.pi - 0.01))
     a, b = (decide_once(controller, plant, rows, memory=each) for each in (memory, other))
     np.testing.assert_allclose(a.command, b.command, atol=1e-9)

@@ -98,3 +98,11 @@ def test_elimination_pivots():
     X = np.array([[2.0], [3.0]])
     lu_solve(A, X)
     np.testing.assert_array_equal(X, [[2.0], [1.0]])
+
+
+@pytest.mark.parametrize("far", [1e2, 1e4, 1e6, 1e8])
+def test_weights_far_apart_have_the_solution_that_scipy_finds(far):
+    P = dare(*HOVER, far * Q, R / far)
+    expected = scipy.linalg.solve_discrete_are(*HOVER, far * Q, R / far)
+    # scipy's own residual there is 1e-13 of P; the condition of the equation takes the rest.
+    np.testing.assert_allclose(P, expected, atol=1e-9 * np.abs(expected).max())

@@ -13,6 +13,7 @@ compiler that no index counts from the end: only then is it vectorised.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,12 +27,30 @@ from ..riccati import step_plan
 
 ByteArray = NDArray[np.int8]
 
-OPTIMAL, INFEASIBLE, ITERATION_LIMIT, NOT_FINITE = range(4)  # the members of Status, for compiled code
+OPTIMAL, INFEASIBLE, ITERATION_LIMIT, NOT_FINITE, INACCURATE = range(
+    5
+)  # the members of Status, for compiled code
 ROW_TOLERANCE = 1e-9  # in the units of the row
-N_VECTORS = 7  # rows of the scratch array `vectors`
-_INACTIVE, _WORKING, _SATURATED = range(3)
+N_VECTORS = 9  # rows of the scratch array `vectors`
+INACTIVE, WORKING, SATURATED = range(3)  # states of a row
 _DEPENDENT = 1e-22  # |J_2'a|^2 over |J'a|^2 below which a normal lies in the span of the working ones
 _NO_DIRECTION = 1e-13  # smallest multiplier direction that counts
+
+
+class RowData(NamedTuple):
+    """All rows of one problem, for compiled code."""
+
+    lower: Array  # (4,), input box
+    upper: Array  # (4,)
+    rate_step: float  # N per sample
+    first_move: Array  # (2, 4), bounds of the rate rows on u_0
+    normals: Array  # (H, 12)
+    normal: IntArray  # (K,)
+    stage: IntArray  # (K,)
+    row_lower: Array  # (K,)
+    row_upper: Array  # (K,)
+    weight: Array  # (K,)
+    spans: IntArray  # (K, 2), as left by `row_spans`
 
 
 @kernel
@@ -49,17 +68,11 @@ def row_spans(normals: Array, spans: IntArray) -> None:
 
 
 @kernel
-def _worst_input_row(
-    u: Array,
-    lower: Array,
-    upper: Array,
-    rate_step: float,
-    first_move: Array,
-    state: ByteArray,
-) -> tuple[int, float]:
+def _worst_input_row(u: Array, rows: RowData, state: ByteArray) -> tuple[int, float]:
     """The inactive box or rate row with the most negative slack; (-1, -tolerance) if there is none."""
     N, m = u.shape
     nv = N * m
+    lower, upper, first_move, rate_step = rows.lower, rows.upper, rows.first_move, rows.rate_step
     worst = -ROW_TOLERANCE
     row = -1
     for i in range(N):
@@ -67,10 +80,10 @@ def _worst_input_row(
             k = m * i + a
             value = u[i, a]
             slack = value - lower[a]
-            if slack < worst and state[k] == _INACTIVE:
+            if slack < worst and state[k] == INACTIVE:
                 worst, row = slack, k
             slack = upper[a] - value
-            if slack < worst and state[nv + k] == _INACTIVE:
+            if slack < worst and state[nv + k] == INACTIVE:
                 worst, row = slack, nv + k
             if i == 0:
                 below = value - first_move[0, a]
@@ -78,29 +91,20 @@ def _worst_input_row(
             else:
                 below = value - u[i - 1, a] + rate_step
                 above = u[i - 1, a] + rate_step - value
-            if below < worst and state[2 * nv + k] == _INACTIVE:
+            if below < worst and state[2 * nv + k] == INACTIVE:
                 worst, row = below, 2 * nv + k
-            if above < worst and state[3 * nv + k] == _INACTIVE:
+            if above < worst and state[3 * nv + k] == INACTIVE:
                 worst, row = above, 3 * nv + k
     return row, worst
 
 
 @kernel
 def _worst_state_row(
-    x: Array,
-    normals: Array,
-    normal: IntArray,
-    stage: IntArray,
-    row_lower: Array,
-    row_upper: Array,
-    weight: Array,
-    spans: IntArray,
-    base: int,
-    state: ByteArray,
-    row: int,
-    worst: float,
+    x: Array, rows: RowData, base: int, state: ByteArray, row: int, worst: float
 ) -> tuple[int, float]:
     """As above among the state rows, where a saturated row that is satisfied counts too; ids from base."""
+    normals, normal, stage, spans = rows.normals, rows.normal, rows.stage, rows.spans
+    row_lower, row_upper, weight = rows.row_lower, rows.row_upper, rows.weight
     K = normal.shape[0]
     for k in range(K):
         h = normal[k]
@@ -110,11 +114,46 @@ def _worst_state_row(
         for side in range(2):
             slack = value - row_lower[k] if side == 0 else row_upper[k] - value
             p = base + side * K + k
-            if state[p] == _SATURATED:
+            if state[p] == SATURATED:
                 slack = -slack
-            if slack < worst and state[p] != _WORKING and weight[k] > 0.0:
+            if slack < worst and state[p] != WORKING and weight[k] > 0.0:
                 worst, row = slack, p
     return row, worst
+
+
+@kernel
+def worst_row(u: Array, x: Array, rows: RowData, state: ByteArray) -> tuple[int, float]:
+    """The row to work on next and its slack, or -1 if the plan (u, x) is optimal."""
+    row, slack = _worst_input_row(u, rows, state)
+    if rows.normal.shape[0] == 0:
+        return row, slack
+    return _worst_state_row(x, rows, 4 * u.size, state, row, slack)
+
+
+@kernel
+def row_slack(p: int, u: Array, x: Array, rows: RowData) -> float:
+    """a_p'u - b_p of any row."""
+    m, nv, K = u.shape[1], u.size, rows.normal.shape[0]
+    value, bound = 0.0, 0.0
+    if p >= 4 * nv:
+        k = (p - 4 * nv) % K
+        h = rows.normals[rows.normal[k]]
+        for a in range(h.shape[0]):
+            value += h[a] * x[rows.stage[k], a]
+        below = p < 4 * nv + K
+        bound = rows.row_lower[k] if below else rows.row_upper[k]
+        return value - bound if below else bound - value
+    i, a = (p % nv) // m, p % m
+    below = (p // nv) % 2 == 0
+    value = u[i, a]
+    if p < 2 * nv:
+        bound = rows.lower[a] if below else rows.upper[a]
+    elif i == 0:
+        bound = rows.first_move[0, a] if below else rows.first_move[1, a]
+    else:
+        value -= u[i - 1, a]
+        bound = -rows.rate_step if below else rows.rate_step
+    return value - bound if below else bound - value
 
 
 @kernel
@@ -158,7 +197,22 @@ def _state_normal(
 
 
 @kernel
-def _project(J_T: Array, a: Array, start: int, stop: int, d: Array) -> float:
+def load_normal(
+    p: int, sign: float, A: Array, B: Array, rows: RowData, nv: int, vectors: Array
+) -> tuple[int, int]:
+    """The normal of any row, times sign for state rows, into vectors[6]; the range outside which it is 0."""
+    a = vectors[6]
+    if p < 4 * nv:
+        return _input_normal(p, nv, a)
+    K = rows.normal.shape[0]
+    k = (p - 4 * nv) % K
+    side = 1.0 if p < 4 * nv + K else -1.0
+    h = rows.normals[rows.normal[k]]
+    return 0, _state_normal(h, rows.stage[k], side * sign, A, B, vectors[0, :12], vectors[1, :12], a)
+
+
+@kernel
+def project(J_T: Array, a: Array, start: int, stop: int, d: Array) -> float:
     """Writes d = J'a, returns |d|^2; a is zero outside start..stop. Four columns at once, to overlap sums."""
     total = 0.0
     for k in range(0, J_T.shape[0], 4):
@@ -175,7 +229,7 @@ def _project(J_T: Array, a: Array, start: int, stop: int, d: Array) -> float:
 
 
 @kernel
-def _primal_direction(J_T: Array, d: Array, q: int, z: Array) -> float:
+def primal_direction(J_T: Array, d: Array, q: int, z: Array) -> float:
     """Writes z = J_2 d_2, returns |d_2|^2."""
     nv = J_T.shape[0]
     zeta = 0.0
@@ -191,7 +245,7 @@ def _primal_direction(J_T: Array, d: Array, q: int, z: Array) -> float:
 
 
 @kernel
-def _solve_triangle(R_T: Array, d: Array, q: int, r: Array) -> None:
+def solve_triangle(R_T: Array, d: Array, q: int, r: Array) -> None:
     """Writes r = R^-1 d_1, by columns."""
     for i in range(q):
         r[i] = d[i]
@@ -200,6 +254,22 @@ def _solve_triangle(R_T: Array, d: Array, q: int, r: Array) -> None:
         factor = r[i]
         for j in range(i):
             r[j] -= factor * R_T[i, j]
+
+
+@kernel
+def solve_triangle_transposed(R_T: Array, s: Array, q: int, y: Array) -> None:
+    """Writes y = R^-T s."""
+    for i in range(q):
+        total = s[i]
+        for k in range(i):
+            total -= R_T[i, k] * y[k]
+        y[i] = total / R_T[i, i]
+
+
+@kernel
+def inactive_after(saturates: bool) -> int:
+    """The state of a row that leaves the working set."""
+    return SATURATED if saturates else INACTIVE
 
 
 @kernel
@@ -221,7 +291,7 @@ def _first_to_leave(nu: Array, r: Array, cap: Array, q: int) -> tuple[float, int
 
 
 @kernel
-def _append(J_T: Array, R_T: Array, d: Array, q: int) -> None:
+def append_row(J_T: Array, R_T: Array, d: Array, q: int) -> None:
     """Adds the row with d = J'a to the working set: rotations leave one entry in d_2, which extends R.
 
     A reflection would need fewer operations but fill J; rotations of neighbours keep most of its zeros, and
@@ -249,7 +319,7 @@ def _rotate(v: Array, w: Array, cos: float, sin: float) -> None:
 
 
 @kernel
-def _remove(
+def remove_row(
     J_T: Array,
     R_T: Array,
     active: IntArray,
@@ -279,16 +349,12 @@ def _remove(
 
 
 @kernel
-def _move(u: Array, z: Array, t: float, nu: Array, r: Array, q: int, primal: bool) -> None:
-    """One step of length t: multipliers along -r (own multiplier up), inputs along z."""
-    for i in range(q):
-        nu[i] -= t * r[i]
-    nu[q] += t
-    if primal:
-        m = u.shape[1]
-        for i in range(u.shape[0]):
-            for a in range(m):
-                u[i, a] += t * z[m * i + a]
+def move_along(u: Array, z: Array, t: float) -> None:
+    """Adds t z to u."""
+    m = u.shape[1]
+    for i in range(u.shape[0]):
+        for a in range(m):
+            u[i, a] += t * z[m * i + a]
 
 
 @kernel
@@ -315,9 +381,9 @@ def _enter(
     d, z, r, sign, nu, cap = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4], vectors[5]
     while iterations < iteration_limit:
         iterations += 1
-        length = _project(J_T, a, a_start, a_stop, d)
-        zeta = _primal_direction(J_T, d, q, z)
-        _solve_triangle(R_T, d, q, r)
+        length = project(J_T, a, a_start, a_stop, d)
+        zeta = primal_direction(J_T, d, q, z)
+        solve_triangle(R_T, d, q, r)
         dual, leaving, at_cap = _first_to_leave(nu, r, cap, q)
         full = -slack / zeta if zeta > _DEPENDENT * length else math.inf
         own = cap[q] - nu[q]
@@ -325,20 +391,22 @@ def _enter(
         if t == math.inf:
             return q, iterations, INFEASIBLE
         primal = full < math.inf
-        _move(u, z, t, nu, r, q, primal)
+        for i in range(q):
+            nu[i] -= t * r[i]
+        nu[q] += t
         if primal:
+            move_along(u, z, t)
             slack += t * zeta
         if full <= dual and full <= own:
-            _append(J_T, R_T, d, q)
-            state[active[q]] = _WORKING
+            append_row(J_T, R_T, d, q)
+            state[active[q]] = WORKING
             return q + 1, iterations, OPTIMAL
         if own <= dual:
             # The multiplier of a row that came from saturation is counted down from its cap.
-            state[active[q]] = _SATURATED if sign[q] > 0.0 else _INACTIVE
+            state[active[q]] = inactive_after(sign[q] > 0.0)
             return q, iterations, OPTIMAL
-        saturates = at_cap == (sign[leaving] > 0.0)
-        state[active[leaving]] = _SATURATED if saturates else _INACTIVE
-        _remove(J_T, R_T, active, sign, nu, cap, leaving, q)
+        state[active[leaving]] = inactive_after(at_cap == (sign[leaving] > 0.0))
+        remove_row(J_T, R_T, active, sign, nu, cap, leaving, q)
         q -= 1
     return q, iterations, ITERATION_LIMIT
 
@@ -349,108 +417,74 @@ def dual_active_set(
     B: Array,
     c: Array,
     transposed: Array,
-    lower: Array,
-    upper: Array,
-    rate_step: float,
-    first_move: Array,
-    normals: Array,
-    normal: IntArray,
-    stage: IntArray,
-    row_lower: Array,
-    row_upper: Array,
-    weight: Array,
+    rows: RowData,
     row: int,
     slack: float,
+    q: int,
+    iterations: int,
     iteration_limit: int,
     u: Array,
     x: Array,
-    multipliers: Array,
     J_T: Array,
     R_T: Array,
     active: IntArray,
-    spans: IntArray,
     state: ByteArray,
     vectors: Array,
-) -> tuple[int, int]:
-    """From the unconstrained optimum u to the constrained one.
+) -> tuple[int, int, int]:
+    """From the optimum u of a face, at first the unconstrained one, to the constrained one.
 
     Args:
         A: (1 or N, 12, 12).
         B: (1 or N, 12, 4).
         c: (N, 12).
         transposed: [A_i B_i]', (1 or N, 16, 12).
-        lower: Input box, (4,).
-        upper: (4,).
-        rate_step: Largest change of an input from stage to stage.
-        first_move: Bounds of the rate rows on u_0, (2, 4).
-        normals: As in `StateRows`, likewise the next five.
-        normal: (K,).
-        stage: (K,).
-        row_lower: (K,).
-        row_upper: (K,).
-        weight: (K,).
-        row: The most violated row of u.
-        slack: Its slack, < 0.
-        iteration_limit: Largest number of steps.
-        u: Inputs, (N, 4); the unconstrained optimum on entry, the result on exit.
+        rows: The rows of the problem.
+        row: The first row to work on, as `worst_row` gives it.
+        slack: Its slack.
+        q: Number of working rows, 0 at the unconstrained optimum.
+        iterations: Steps done before.
+        iteration_limit: Largest number of steps, those before included.
+        u: Inputs, (N, 4); the optimum of the face on entry, the result on exit.
         x: Its states, (N+1, 12), likewise.
-        multipliers: Result, (16N + 2K,), in the numbering of the rows.
         J_T: Inverse factor of the Hessian by columns, (4N, 4N); destroyed.
-        R_T: Overwritten, (4N, 4N).
-        active: Overwritten, (4N + 1,).
-        spans: As left by `row_spans`.
-        state: All rows inactive (zero) on entry, (16N + 2K,).
-        vectors: Overwritten, (N_VECTORS, 4N + 12).
+        R_T: Overwritten behind its first q columns, (4N, 4N).
+        active: The working rows, (4N + 1,).
+        state: State of every row, (16N + 2K,).
+        vectors: Scratch (N_VECTORS, 4N + 12); 3, 4, 5 are sign, multiplier and cap of the working rows.
 
     Returns:
-        OPTIMAL, INFEASIBLE or ITERATION_LIMIT, and the number of steps.
+        OPTIMAL, INFEASIBLE or ITERATION_LIMIT, the number of steps, and q.
     """
-    N, m = u.shape
-    K = normal.shape[0]
-    nv = N * m
+    N = u.shape[0]
+    nv = u.size
+    K = rows.normal.shape[0]
     base = 4 * nv
     a, sign, nu, cap = vectors[6], vectors[3], vectors[4], vectors[5]
-    q = 0
-    iterations = 0
     status = OPTIMAL
     while row >= 0:
         active[q] = row
         nu[q] = 0.0
-        sign[q] = 1.0
-        cap[q] = math.inf
-        if row < base:
-            a_start, a_stop = _input_normal(row, nv, a)
-        else:
-            k = (row - base) % K
-            sign[q] = -1.0 if state[row] == _SATURATED else 1.0
-            cap[q] = weight[k]
-            side = 1.0 if row < base + K else -1.0
-            a_start = 0
-            a_stop = _state_normal(
-                normals[normal[k]], stage[k], side * sign[q], A, B, vectors[0, :12], vectors[1, :12], a
-            )
+        sign[q] = -1.0 if state[row] == SATURATED else 1.0
+        cap[q] = rows.weight[(row - base) % K] if row >= base else math.inf
+        a_start, a_stop = load_normal(row, sign[q], A, B, rows, nv, vectors)
         q, iterations, status = _enter(
             J_T, R_T, a, a_start, a_stop, slack, u, state, active, vectors, q, iterations, iteration_limit
         )
         if status != OPTIMAL:
             break
-        row, slack = _worst_input_row(u, lower, upper, rate_step, first_move, state)
         if K > 0:
             # Input rows first and state rows only when none is left would save the roll-out here, but takes
             # twice the steps where many state rows are saturated.
             for i in range(N):
                 step_plan(transposed, c, i, u, x)
-            row, slack = _worst_state_row(
-                x, normals, normal, stage, row_lower, row_upper, weight, spans, base, state, row, slack
-            )
+        row, slack = worst_row(u, x, rows, state)
     for i in range(N):
         step_plan(transposed, c, i, u, x)
-    _collect_multipliers(state, active, sign, nu, cap, weight, q, base, multipliers)
-    return status, iterations
+    return status, iterations, q
 
 
 @kernel
-def _collect_multipliers(
+def collect_multipliers(
     state: ByteArray,
     active: IntArray,
     sign: Array,
@@ -461,36 +495,10 @@ def _collect_multipliers(
     base: int,
     multipliers: Array,
 ) -> None:
-    """Multiplier of every row: counted up from 0 or down from the cap if working, the cap if saturated."""
+    """Multiplier of every working and saturated row: counted up from 0 or down from the cap, or the cap."""
     K = weight.shape[0]
     for k in range(2 * K):
-        if state[base + k] == _SATURATED:
+        if state[base + k] == SATURATED:
             multipliers[base + k] = weight[k % K]
     for i in range(q):
         multipliers[active[i]] = nu[i] if sign[i] > 0.0 else cap[i] - nu[i]
-
-
-@kernel
-def worst_row(
-    u: Array,
-    x: Array,
-    lower: Array,
-    upper: Array,
-    rate_step: float,
-    first_move: Array,
-    normals: Array,
-    normal: IntArray,
-    stage: IntArray,
-    row_lower: Array,
-    row_upper: Array,
-    weight: Array,
-    spans: IntArray,
-    state: ByteArray,
-) -> tuple[int, float]:
-    """The row to work on next and its slack, or -1 if the plan (u, x) is optimal."""
-    row, slack = _worst_input_row(u, lower, upper, rate_step, first_move, state)
-    if normal.shape[0] == 0:
-        return row, slack
-    return _worst_state_row(
-        x, normals, normal, stage, row_lower, row_upper, weight, spans, 4 * u.size, state, row, slack
-    )

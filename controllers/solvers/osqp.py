@@ -203,9 +203,13 @@ class OsqpSolver:
         eps: Absolute and relative tolerance; 1e-5 gives inputs to 3e-4 N, OSQP's own 1e-3 to 0.1 N.
         max_iter: Iteration limit.
         polishing: Whether OSQP tries to solve the active rows exactly at the end.
+        persistent: Whether the workspace serves the next solve too. If not, each result depends on its own
+            problem alone; otherwise scaling, step size and start come from those before, within `eps`.
     """
 
-    def __init__(self, eps: float = 1e-5, max_iter: int = 20000, polishing: bool = False) -> None:
+    def __init__(
+        self, eps: float = 1e-5, max_iter: int = 20000, polishing: bool = False, persistent: bool = True
+    ) -> None:
         if not eps > 0.0:
             raise ValueError(f"eps must be > 0, got {eps}")
         if max_iter < 1:
@@ -216,6 +220,7 @@ class OsqpSolver:
             "max_iter": max_iter,
             "polishing": polishing,
         }
+        self.persistent = persistent
         self._problem: _Problem | None = None
         self._horizon = 0
 
@@ -231,13 +236,14 @@ class OsqpSolver:
             problem.update(qp)
         else:
             problem = _Problem(qp, self.settings)
-            self._problem, self._horizon = problem, len(qp.c)
+            if self.persistent:
+                self._problem, self._horizon = problem, len(qp.c)
         result = problem.solver.solve(raise_error=False)
         return _read(qp, result)
 
     def __getstate__(self) -> dict[str, Any]:
         """The settings alone: the OSQP object does not pickle and is built again on the first solve."""
-        return {"settings": self.settings, "_problem": None, "_horizon": 0}
+        return {**self.__dict__, "_problem": None, "_horizon": 0}
 
 
 def _read(qp: OcpQp, result: Any) -> Solution:

@@ -19,6 +19,7 @@ class Status(IntEnum):
     INFEASIBLE = 1  # hard rows contradict each other
     ITERATION_LIMIT = 2
     NOT_FINITE = 3  # the data or the result hold NaN or infinity
+    INACCURATE = 4  # round-off leaves a relative stationarity, or a row's relative violation, above 1e-6
 
 
 class Multipliers(NamedTuple):

@@ -3,7 +3,10 @@
 1. A Riccati pass gives the unconstrained optimum. If it satisfies every row it is the solution.
 2. Otherwise the closed loop of the same recursion gives J with H^-1 = J J', the inverse factor of the
    condensed Hessian: J is the impulse response from whitened inputs to inputs, so neither H nor its Cholesky
-   factor is ever formed. The dual active set (`active_set.py`) starts from there.
+   factor is ever formed. The dual active set (`active_set.py`) starts from there, or from a guess of the
+   working set (`working_set.py`).
+3. The gradient of the Lagrangian is evaluated, refined once if need be, and only a small one is called
+   optimal (`stationarity.py`).
 """
 
 from __future__ import annotations
@@ -18,19 +21,29 @@ from quad_envs.parameters import N_INPUT, N_STATE, Array
 
 from ..linalg import fill
 from ..ocp import IntArray, OcpQp, validate
-from ..riccati import RICCATI_SCRATCH, optimal_plan, riccati_pass
+from ..riccati import RICCATI_SCRATCH, optimal_plan, riccati_pass, step_plan
 from .active_set import (
+    INACCURATE,
+    INFEASIBLE,
     N_VECTORS,
     NOT_FINITE,
     OPTIMAL,
+    ROW_TOLERANCE,
     ByteArray,
+    RowData,
+    collect_multipliers,
     dual_active_set,
+    row_slack,
     row_spans,
     worst_row,
 )
 from .solution import Multipliers, Solution, Status
+from .stationarity import REFINED, STATIONARY, lagrangian_gradient
+from .working_set import correct, start_from_guess
 
-ITERATION_LIMIT = 2000  # the largest number seen on random problems is 740
+ITERATION_LIMIT = 0  # stands for a limit that grows with the problem, `step_limit`
+_STEPS, _STEPS_PER_ROW = 2000, 20  # random problems with horizons up to 60 stay below
+_ROW_ERROR = 1e-7  # largest violation of a row that a refined solution may have, as `STATIONARY`
 
 
 class Workspace(NamedTuple):
@@ -44,13 +57,18 @@ class Workspace(NamedTuple):
     D: Array  # (N, 4, 4), inverse Cholesky factors
     A_cl: Array  # (N, 12, 12), closed loops
     P_c: Array  # (N, 12)
+    first_move: Array  # (2, 4), bounds on u_0
     scratch: Array  # (RICCATI_SCRATCH, 12, 12)
     wide: Array  # (2, 12, 4N)
     factors: Array  # (2, 4N, 4N): J and R, by columns
     vectors: Array  # (N_VECTORS, 4N + 12)
+    gradient: Array  # (4N,), of the Lagrangian
+    force: Array  # (N+1, 12)
+    states: Array  # (N+1, 12)
     active: IntArray  # (4N + 1,)
     spans: IntArray  # (K, 2)
-    state: ByteArray  # (16N + 2K,)
+    state: ByteArray  # (16N + 2K,), of every row at the end
+    guess: ByteArray  # (16N + 2K,), of every row, to start from
 
 
 def make_workspace(horizon: int, n_rows: int, n_models: int) -> Workspace:
@@ -80,13 +98,18 @@ def make_workspace(horizon: int, n_rows: int, n_models: int) -> Workspace:
         D=np.zeros((N, m, m)),
         A_cl=np.zeros((N, n, n)),
         P_c=np.zeros((N, n)),
+        first_move=np.zeros((2, m)),
         scratch=np.zeros((RICCATI_SCRATCH, n, n)),
         wide=np.zeros((2, n, nv)),
         factors=np.zeros((2, nv, nv)),
         vectors=np.zeros((N_VECTORS, nv + n)),
+        gradient=np.zeros(nv),
+        force=np.zeros((N + 1, n)),
+        states=np.zeros((N + 1, n)),
         active=np.zeros(nv + 1, dtype=np.int64),
         spans=np.zeros((n_rows, 2), dtype=np.int64),
         state=np.zeros(4 * nv + 2 * n_rows, dtype=np.int8),
+        guess=np.zeros(4 * nv + 2 * n_rows, dtype=np.int8),
     )
 
 
@@ -172,6 +195,122 @@ def _all_finite(values: Array) -> bool:
 
 
 @kernel
+def step_limit(iteration_limit: int, horizon: int, n_rows: int) -> int:
+    """Largest number of active-set steps: as asked, or growing with the rows of the problem if 0.
+
+    The limit counts steps, not time: a step takes at most a fixed number of operations, and what is decided
+    must not depend on how busy the machine is.
+    """
+    if iteration_limit > 0:
+        return iteration_limit
+    return _STEPS + _STEPS_PER_ROW * (4 * N_INPUT * horizon + 2 * n_rows)
+
+
+@kernel
+def _has_hard_rows(rows: RowData) -> bool:
+    for k in range(rows.weight.shape[0]):
+        if rows.weight[k] == math.inf:
+            return True
+    return False
+
+
+@kernel
+def _clear(values: Array | ByteArray, n: int) -> None:
+    for k in range(n):
+        values[k] = 0
+
+
+@kernel
+def _largest_gap(rows: RowData, q: int, ws: Workspace) -> float:
+    """How far a working row is from equality, over 1 + the largest input; in states summed anew."""
+    largest, gap = 1.0, 0.0
+    for k in range(ws.u.shape[0]):
+        for a in range(N_INPUT):
+            largest = max(largest, 1.0 + abs(ws.u[k, a]))
+    for i in range(q):
+        gap = max(gap, abs(row_slack(ws.active[i], ws.u, ws.states, rows)))
+    return gap / largest
+
+
+@kernel
+def _finish(
+    A: Array,
+    B: Array,
+    c: Array,
+    Q: Array,
+    R: Array,
+    Q_f: Array,
+    x_0: Array,
+    r: Array,
+    rows: RowData,
+    q: int,
+    ws: Workspace,
+) -> int:
+    """Multipliers, and OPTIMAL or INACCURATE for the face reached: refined once if it is not stationary."""
+    u, x = ws.u, ws.x
+    sign, nu, cap = ws.vectors[3], ws.vectors[4], ws.vectors[5]
+    n_rows = 4 * u.size + 2 * rows.normal.shape[0]
+    transposed = ws.transposed[: A.shape[0]]
+    relative, gap = math.inf, math.inf
+    for attempt in range(2):
+        if attempt == 1:
+            correct(rows, ws.gradient, u, x, ws.factors[0], ws.factors[1], ws.active, ws.vectors, q)
+            for i in range(u.shape[0]):
+                step_plan(transposed, c, i, u, x)
+        _clear(ws.multipliers, n_rows)
+        collect_multipliers(ws.state, ws.active, sign, nu, cap, rows.weight, q, 4 * u.size, ws.multipliers)
+        relative = lagrangian_gradient(
+            A, B, c, Q, R, Q_f, x_0, r, transposed, rows, u, ws.multipliers, ws.states, ws.force, ws.gradient,
+            ws.scratch[1],
+        )  # fmt: skip
+        gap = _largest_gap(rows, q, ws)
+        if attempt == 0 and relative <= REFINED and gap <= ROW_TOLERANCE:
+            return OPTIMAL
+    _, slack = worst_row(u, x, rows, ws.state)
+    return OPTIMAL if relative <= STATIONARY and max(gap, -slack) <= _ROW_ERROR else INACCURATE
+
+
+@kernel
+def _solve_rows(
+    A: Array,
+    B: Array,
+    c: Array,
+    Q: Array,
+    R: Array,
+    Q_f: Array,
+    stationary: bool,
+    x_0: Array,
+    r: Array,
+    rows: RowData,
+    warm: bool,
+    iterations: int,
+    iteration_limit: int,
+    ws: Workspace,
+) -> tuple[int, int]:
+    """From the unconstrained optimum in ws to the constrained one; with `warm` by way of ws.guess."""
+    u, x, transposed = ws.u, ws.x, ws.transposed[: A.shape[0]]
+    J_T, R_T = ws.factors[0], ws.factors[1]
+    inverse_factor(ws.K, ws.D, ws.A_cl, B, stationary, J_T, ws.wide)
+    q = 0
+    _clear(ws.state, 4 * u.size + 2 * rows.normal.shape[0])
+    if warm:
+        guess = ws.guess[: 4 * u.size + 2 * rows.normal.shape[0]]
+        q, changes = start_from_guess(
+            A, B, c, transposed, rows, guess, u, x, J_T, R_T, ws.active, ws.state, ws.force, ws.vectors
+        )
+        iterations += changes
+    row, slack = worst_row(u, x, rows, ws.state)
+    status, iterations, q = dual_active_set(
+        A, B, c, transposed, rows, row, slack, q, iterations, iteration_limit,
+        u, x, J_T, R_T, ws.active, ws.state, ws.vectors,
+    )  # fmt: skip
+    if not (_all_finite(u) and _all_finite(x)):
+        return NOT_FINITE, iterations
+    finished = _finish(A, B, c, Q, R, Q_f, x_0, r, rows, q, ws)
+    return (finished if status == OPTIMAL else status), iterations
+
+
+@kernel
 def solve_structured(
     A: Array,
     B: Array,
@@ -193,12 +332,14 @@ def solve_structured(
     row_upper: Array,
     weight: Array,
     iteration_limit: int,
+    warm: bool,
     ws: Workspace,
 ) -> tuple[int, int]:
     """Solve one OCP-QP, data as in `OcpQp` and `StateRows`. Nothing is allocated and nothing is validated.
 
     Arrays are passed one by one because that unpacks twice as fast as a NamedTuple. Compiled loops may call
-    it, with one workspace per thread.
+    it, with one workspace per thread. A warm start that ends without an optimum is done again cold, and a
+    cold one that accuracy let down once more from the working set that it reached.
 
     Args:
         A: (1 or N, 12, 12).
@@ -220,12 +361,14 @@ def solve_structured(
         row_lower: (K,).
         row_upper: (K,).
         weight: (K,).
-        iteration_limit: Largest number of active-set steps, ITERATION_LIMIT unless time is scarce.
-        ws: From `make_workspace` for this N, at least K rows and at least this many pairs; ws.u, ws.x and
-            ws.multipliers[: 16N + 2K] receive the result.
+        iteration_limit: As in `step_limit`.
+        warm: Whether ws.guess[: 16N + 2K] holds a guess of the state of every row to start from.
+        ws: From `make_workspace` for this N, at least K rows and at least this many pairs; ws.u, ws.x,
+            ws.multipliers[: 16N + 2K] and ws.state[: 16N + 2K] receive the result.
 
     Returns:
-        Status as an integer, and the number of active-set steps: 0 if the Riccati plan satisfies every row.
+        Status as an integer, and the number of active-set steps: changes of the unconstrained plan's or the
+        guessed working set, 0 if the Riccati plan satisfies every row.
     """
     N, K = c.shape[0], normal.shape[0]
     if (
@@ -236,34 +379,65 @@ def solve_structured(
         raise ValueError("the workspace does not fit the problem: make it with its horizon, rows and pairs")
     u, x, n_rows = ws.u, ws.x, 4 * N_INPUT * N + 2 * K
     transposed = ws.transposed[: A.shape[0]]
-    for k in range(n_rows):
-        ws.multipliers[k] = 0.0
-        ws.state[k] = 0
+    _clear(ws.multipliers, n_rows)
+    _clear(ws.state, n_rows)
     riccati_pass(A, B, c, Q, R, Q_f, stationary, transposed, ws.K, ws.D, ws.A_cl, ws.P_c, ws.scratch)
-    optimal_plan(B, c, Q, Q_f, x_0, r, stationary, transposed, ws.K, ws.D, ws.A_cl, ws.P_c, u, x, ws.scratch)
-    last = u_last[0] + u_last[1] + u_last[2] + u_last[3]
-    if not (abs(last) < math.inf and _all_finite(r) and _all_finite(u) and _all_finite(x)):
-        return NOT_FINITE, 0
-    first_move = ws.scratch[0, :2, :N_INPUT]
+    first_move = ws.first_move
     for a in range(N_INPUT):
         first_move[0, a] = min(u_last[a] - rate_step, upper[a])
         first_move[1, a] = max(u_last[a] + rate_step, lower[a])
     row_spans(normals, ws.spans)
-    row, slack = worst_row(
-        u, x, lower, upper, rate_step, first_move,
-        normals, normal, stage, row_lower, row_upper, weight, ws.spans, ws.state,
+    rows = RowData(
+        lower, upper, rate_step, first_move,
+        normals, normal, stage, row_lower, row_upper, weight, ws.spans,
     )  # fmt: skip
-    if row < 0:
-        return OPTIMAL, 0
-    J_T = ws.factors[0]
-    inverse_factor(ws.K, ws.D, ws.A_cl, B, stationary, J_T, ws.wide)
-    status, iterations = dual_active_set(
-        A, B, c, transposed, lower, upper, rate_step, first_move,
-        normals, normal, stage, row_lower, row_upper, weight, row, slack, iteration_limit,
-        u, x, ws.multipliers, J_T, ws.factors[1], ws.active, ws.spans, ws.state, ws.vectors,
-    )  # fmt: skip
-    if not (_all_finite(u) and _all_finite(x)):
-        return NOT_FINITE, iterations
+    last = u_last[0] + u_last[1] + u_last[2] + u_last[3]
+    finite = abs(last) < math.inf and _all_finite(r)
+    limit = step_limit(iteration_limit, N, K)
+    status, iterations = NOT_FINITE, 0
+    for attempt in range(3):
+        optimal_plan(
+            B, c, Q, Q_f, x_0, r, stationary, transposed, ws.K, ws.D, ws.A_cl, ws.P_c, u, x, ws.scratch
+        )
+        if not (finite and _all_finite(u) and _all_finite(x)):
+            return NOT_FINITE, iterations
+        if attempt == 0 and worst_row(u, x, rows, ws.state)[0] < 0:
+            relative = lagrangian_gradient(
+                A,
+                B,
+                c,
+                Q,
+                R,
+                Q_f,
+                x_0,
+                r,
+                transposed,
+                rows,
+                u,
+                ws.multipliers,
+                ws.states,
+                ws.force,
+                ws.gradient,
+                ws.scratch[1],
+            )
+            if relative <= STATIONARY:
+                return OPTIMAL, 0
+        # A warm start gets half of the steps, so that a cold one is left.
+        steps = (iterations + limit + 1) // 2 if warm and attempt == 0 else limit
+        status, iterations = _solve_rows(
+            A, B, c, Q, R, Q_f, stationary, x_0, r, rows, warm, iterations, steps, ws
+        )
+        if status == OPTIMAL or iterations >= limit:
+            break
+        hard = status == INFEASIBLE and _has_hard_rows(rows)
+        if hard or (attempt > 0 and warm):
+            break
+        warm = not (warm and attempt == 0)
+        if warm:
+            for k in range(n_rows):
+                ws.guess[k] = ws.state[k]
+    if status == INFEASIBLE and not _has_hard_rows(rows):
+        status = INACCURATE  # box, rate and soft rows cannot contradict each other
     return status, iterations
 
 
@@ -271,12 +445,14 @@ class StructuredSolver:
     """Backend over `solve_structured`: validates, keeps a workspace, copies the result out.
 
     Args:
-        iteration_limit: Largest number of active-set steps per problem.
+        iteration_limit: Largest number of active-set steps per problem; 0 for one that grows with it.
     """
 
     def __init__(self, iteration_limit: int = ITERATION_LIMIT) -> None:
-        if iteration_limit < 1:
-            raise ValueError(f"iteration_limit must be at least 1, got {iteration_limit}")
+        if iteration_limit < 0:
+            raise ValueError(
+                f"iteration_limit must be at least 1, or 0 to grow with the problem, got {iteration_limit}"
+            )
         self.iteration_limit = iteration_limit
         self._workspace: Workspace | None = None
 
@@ -291,7 +467,7 @@ class StructuredSolver:
         N, K = len(qp.c), len(rows.normal)
         ws = self._fitting_workspace(N, K, len(qp.A))
         status, iterations = solve_structured(
-            *qp[:-3], float(qp.rate_step), qp.u_last, *rows, self.iteration_limit, ws
+            *qp[:-3], float(qp.rate_step), qp.u_last, *rows, self.iteration_limit, False, ws
         )
         nv = N_INPUT * N
         edges = [nv, 2 * nv, 3 * nv, 4 * nv, 4 * nv + K]
