@@ -142,7 +142,7 @@ def row_slack(p: int, u: Array, x: Array, rows: RowData) -> float:
             value += h[a] * x[rows.stage[k], a]
         below = p < 4 * nv + K
         bound = rows.row_lower[k] if below else rows.row_upper[k]
-        return value - bound if below else bound - value
+        return float(value - bound) if below else float(bound - value)
     i, a = (p % nv) // m, p % m
     below = (p // nv) % 2 == 0
     value = u[i, a]
@@ -153,7 +153,7 @@ def row_slack(p: int, u: Array, x: Array, rows: RowData) -> float:
     else:
         value -= u[i - 1, a]
         bound = -rows.rate_step if below else rows.rate_step
-    return value - bound if below else bound - value
+    return float(value - bound) if below else float(bound - value)
 
 
 @kernel

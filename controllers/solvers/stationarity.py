@@ -13,7 +13,7 @@ from ..linalg import add_matvec_transposed, fill
 from .active_set import RowData
 
 REFINED = 1e-9  # relative stationarity above which a solution is refined once
-STATIONARY = 1e-7  # above which it is not called optimal: 1e-6, less what the order of summation may add
+STATIONARY = 1e-8  # and above which it is not called optimal: 1e-6 less what another order of summation adds
 
 
 @kernel
