@@ -26,8 +26,7 @@ from .cooperative_decoding import (
     part_starts,
     split_memory,
 )
-from .estimation import EstimatorPolicy, SharedEstimatePolicy, TargetEstimator, shared_estimates
-from .estimation_kernels import FILTER_SIZE
+from .estimation import AgentFilters, EstimatorPolicy, SharedEstimatePolicy, make_estimator, shared_estimates
 from .policy import N_FALLBACKS, Actions, Counts, Estimates, PolicyState
 from .rows import not_finite
 from .team_policies import Flags, TeamPolicy
@@ -200,8 +199,8 @@ class TargetMpc(CooperativePolicy):
         estimator: The agents' filters; None: the estimates in the observation.
     """
 
-    def __init__(self, controller: CooperativeMpc, estimator: TargetEstimator | None) -> None:
-        super().__init__(controller, "cooperative-mpc", 0 if estimator is None else FILTER_SIZE)
+    def __init__(self, controller: CooperativeMpc, estimator: AgentFilters | None) -> None:
+        super().__init__(controller, "cooperative-mpc", 0 if estimator is None else estimator.size)
         self.estimator = estimator
 
     def _decide(self, obs: Actions, state: PolicyState, start: Flags) -> tuple[Actions, PolicyState]:
@@ -221,7 +220,8 @@ def make_cooperative_mpc(
     alpha: float = 1.0,
     terminal_weight: CooperativeTerminalWeight = "hover",
     *,
-    q: float | None = None,
+    estimator: Any = None,
+    q: Any = None,
     estimates: EstimateSource | None = None,
     neighbour: Neighbour = "cv",
     feed_forward: bool = True,
@@ -248,9 +248,10 @@ def make_cooperative_mpc(
     """The policy of chapter 7. Where vehicles run on rails, its answer is its estimate.
 
     Options are those of `controllers.cooperative_mpc.CooperativeMpc` (reach is 2 m: the target is far at the
-    start), and two more. `q` is the density of the target's acceleration in the filter, m^2/s^3; None: 0.02
-    for estimation, 0.05 for tracking. `estimates` is "own", a filter per agent in `state`, or "shared", what
-    `EstimateWrapper` put into the observation; None: shared where it is there.
+    start), and three more. `estimator` is "ekf" (None), "trilateration", "polar-ekf", "random-walk" or an
+    object of the user's, and `q` belongs to it, see `baselines.estimation.make_estimator`; None: 0.02 for
+    estimation, 0.05 m^2/s^3 for tracking. `estimates` is "own", a filter per agent in `state`, or "shared",
+    what `EstimateWrapper` put into the observation; None: shared where it is there.
 
     Behind the target "aircraft", at up to 2.5 m/s, 1.0 m of error are left (RMS of the last 5 s, 20 flights,
     no crash), and 0.86 m with `q=0.4` and `speed=4`: the reference has the target's velocity and not its
@@ -259,7 +260,7 @@ def make_cooperative_mpc(
     Raises:
         ValueError: If the task has no target, or an option is not allowed.
     """
-    name, shared = "cooperative-mpc", _shares_estimates(task, estimates, q)
+    name, shared = "cooperative-mpc", _shares_estimates(task, estimates, q, estimator)
     controller = CooperativeMpc(
         task, horizon, alpha, terminal_weight, neighbour=neighbour, feed_forward=feed_forward,
         attitude=attitude, reach=reach, speed=speed, formation_weight=formation_weight, target=target,
@@ -270,11 +271,11 @@ def make_cooperative_mpc(
         estimator_gain=estimator_gain, iteration_limit=iteration_limit,
     )  # fmt: skip
     if task.mission != "estimation":
-        return TargetMpc(controller, None if shared else TargetEstimator(task, q))
-    return SharedEstimatePolicy(task, name) if shared else EstimatorPolicy(task, name, q, trilaterate=False)
+        return TargetMpc(controller, None if shared else make_estimator(task, estimator, q))
+    return SharedEstimatePolicy(task, name) if shared else EstimatorPolicy(task, name, estimator, q)
 
 
-def _shares_estimates(task: TeamTask, estimates: Any, q: float | None) -> bool:
+def _shares_estimates(task: TeamTask, estimates: Any, q: Any, estimator: Any) -> bool:
     """Whether the estimates come from the observation.
 
     Raises:
@@ -288,8 +289,9 @@ def _shares_estimates(task: TeamTask, estimates: Any, q: float | None) -> bool:
             f"estimates='shared' needs estimates in the observation of {task.env_id!r}: put an "
             "EstimateWrapper around the environment, or take estimates='own'"
         )
-    if shared and q is not None:
-        raise ValueError(
-            f"q = {q!r} belongs to a filter of one's own: give it to the EstimateWrapper instead"
-        )
+    for name, value in (("q", q), ("estimator", estimator)):
+        if shared and value is not None:
+            raise ValueError(
+                f"{name} = {value!r} belongs to a filter of one's own: give it to the EstimateWrapper instead"
+            )
     return bool(shared)

@@ -30,8 +30,8 @@ from quad_envs.names import unknown_name
 from quad_envs.parameters import Array
 from quad_envs.tasks import TeamTask
 
-from .estimation import TargetEstimator
-from .estimation_kernels import FILTER_SIZE, P, X
+from .estimation import make_estimator
+from .estimation_kernels import P, X
 from .policy import Actions
 
 Fusion = Literal["trace", "equal", "determinant", "none"]
@@ -61,14 +61,15 @@ class EstimateWrapper(BaseParallelWrapper):  # type: ignore[misc]
         env: A ParallelEnv of this suite with a target.
         fusion: Weights of the covariance intersection: "trace" (1 / tr P), "equal", "determinant" (smallest
             determinant); "none": nobody tells anybody.
-        q: Density of the target's acceleration in the filters, m^2/s^3; None: 0.02 for estimation, 0.05 for
-            tracking.
+        q: Of the target's motion in the filters, see `baselines.estimation.make_estimator`; None: 0.02 for
+            estimation, 0.05 m^2/s^3 for tracking.
+        estimator: "ekf", "trilateration", "polar-ekf", "random-walk", or an object of the user's.
 
     Raises:
         ValueError: If the environment has no target, or estimates already, or an option is not allowed.
     """
 
-    def __init__(self, env: Any, fusion: Fusion = "trace", q: float | None = None) -> None:
+    def __init__(self, env: Any, fusion: Fusion = "trace", q: Any = None, estimator: Any = "ekf") -> None:
         super().__init__(env)
         inner = getattr(env, "task", None)
         if not isinstance(inner, TeamTask) or inner.layout.estimate:
@@ -79,7 +80,12 @@ class EstimateWrapper(BaseParallelWrapper):  # type: ignore[misc]
         if fusion not in get_args(Fusion):
             raise ValueError(unknown_name("fusion", fusion, get_args(Fusion)))
         self._inner, self.fusion = inner, fusion
-        self.estimator = TargetEstimator(inner, q)
+        self.estimator = make_estimator(inner, estimator, q)
+        if fusion != "none" and not self.estimator.can_fuse:
+            raise ValueError(
+                f"{estimator!r} cannot take fused estimates over: give it `replaced(memory, x, P)`, or "
+                "choose fusion='none'"
+            )
         self.task = replace(inner, layout=replace(inner.layout, estimate=True))
         size = self.task.layout.size
         self.observation_spaces = {
@@ -91,7 +97,7 @@ class EstimateWrapper(BaseParallelWrapper):  # type: ignore[misc]
     def _begin(self) -> None:
         n, K = self._senders.shape
         self._step = 0
-        self._filters: Array = np.zeros((n, FILTER_SIZE))
+        self._filters: Array = np.zeros((n, self.estimator.size))
         self._told = np.full((n, K), -1, dtype=np.int64)  # step at which the last message of a slot was sent
         self._sent: list[tuple[Array, Array]] = []  # estimates of all agents before fusion, step by step
 
@@ -144,7 +150,7 @@ class EstimateWrapper(BaseParallelWrapper):  # type: ignore[misc]
     def _exchange(self, agents: NDArray[np.int64], filters: Array, comm: Array) -> _Heard:
         """What the messages that arrive in this step bring."""
         n, K, layout = len(agents), self._senders.shape[1], self._inner.layout
-        everybody = np.zeros((len(self._filters), FILTER_SIZE))
+        everybody = np.zeros_like(self._filters)
         everybody[agents] = filters
         self._sent.append((everybody[:, X].copy(), everybody[:, P].reshape(-1, 6, 6).copy()))
         heard = _Heard(np.zeros((n, K, 6)), np.zeros((n, K, 6, 6)), np.zeros((n, K), dtype=np.bool_))
@@ -174,7 +180,7 @@ class EstimateWrapper(BaseParallelWrapper):  # type: ignore[misc]
         return x @ F.T, F @ covariance @ F.T + Q
 
     def _fused(self, filters: Array, heard: _Heard) -> Array:
-        """The filters after covariance intersection, (m, FILTER_SIZE)."""
+        """The filters after covariance intersection, (m, size)."""
         if not heard.valid.any():
             return filters
         n = len(filters)
@@ -187,7 +193,7 @@ class EstimateWrapper(BaseParallelWrapper):  # type: ignore[misc]
         )
         out = filters.copy()
         out[:, X], out[:, P] = fused.x, fused.P.reshape(n, 36)
-        return out
+        return self.estimator.take_over(out)
 
     def _block(self, filters: Array, heard: _Heard) -> Actions:
         """The estimate block of the observation, (m, (1 + K) 13)."""

@@ -10,55 +10,40 @@ acceleration at both ends; during a step of the rotor forces it is off by some 0
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
+from controllers.estimation import PolarEstimator, RandomWalkEstimator
 from controllers.estimation.ekf import Restart
 from controllers.estimation.trilateration import acceptance_limits
 from controllers.estimation.trilateration_kernels import MAX_RATIO
 from quad_envs.agent_observations import N_ESTIMATE
 from quad_envs.envs.team_kernel import ESTIMATE_REACH, ESTIMATE_SPEED
+from quad_envs.names import unknown_name
 from quad_envs.parameters import Array
 from quad_envs.sensors import sensor_rows
 from quad_envs.tasks import TeamTask
 
-from .cooperative_decoding import Decoded, empty_parts, part_starts
+from .cooperative_decoding import empty_parts, part_starts
 from .estimation_kernels import (
     FILTER_SIZE,
     N_REPORT,
     FilterData,
-    P,
-    X,
     decode_and_filter,
     filter_scratch,
 )
+from .filtered import Filtered
+from .own_estimator import OwnEstimator
 from .policy import Actions, Estimates, PolicyState
 from .rows import not_finite
 from .team_policies import Flags, TeamPolicy, plain_state, require_finite
 
 DEFAULT_Q = {"estimation": 0.02, "target-tracking": 0.05}  # m^2/s^3
+EstimatorName = Literal["ekf", "trilateration", "polar-ekf", "random-walk"]
+Model = Literal["cv", "aircraft", "random-walk"]
+_MODELS: dict[str, EstimatorName] = {"cv": "ekf", "aircraft": "polar-ekf", "random-walk": "random-walk"}
 _VECH = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # xx, xy, xz, yy, yz, zz
-
-
-class Filtered(NamedTuple):
-    """Rows after a step of their filters."""
-
-    parts: Decoded
-    first: Array  # (n, a), what else the memory holds
-    filters: Array  # (n, FILTER_SIZE)
-    reports: Array  # (n, N_REPORT)
-    trilaterates: bool  # whether a position may enter instead of the ranges
-
-    @property
-    def estimates(self) -> Estimates:
-        """What the filters believe."""
-        n, x = len(self.filters), self.filters[:, X]
-        covariance = self.filters[:, P].reshape(n, 6, 6).copy()
-        counts = self.reports[:, 1:].astype(np.int64)
-        nis = self.reports[:, 0].copy()
-        fixed = counts[:, 2] > 0 if self.trilaterates else None
-        return Estimates(x[:, :3].copy(), x[:, 3:].copy(), covariance, nis, counts[:, 0], counts[:, 1], fixed)
 
 
 class TargetEstimator:
@@ -73,18 +58,13 @@ class TargetEstimator:
         ValueError: If the task has no target, or q is negative.
     """
 
+    size = FILTER_SIZE  # numbers in the memory of an agent
+    can_fuse = True
+
     def __init__(self, task: TeamTask, q: float | None = None, trilaterate: bool = False) -> None:
-        if not task.layout.target:
-            raise ValueError(
-                f"there is no target to estimate in {task.env_id!r} (mission {task.mission!r}); take "
-                "quad/TargetTracking-v0 or quad/CooperativeEstimation-v0"
-            )
-        density = DEFAULT_Q[task.mission] if q is None else q
-        if isinstance(density, bool) or not isinstance(density, int | float | np.integer | np.floating):
-            raise ValueError(f"q must be a number, m^2/s^3, got {q!r}")
-        if not 0.0 <= density < np.inf:
-            raise ValueError(f"q must be finite and >= 0 m^2/s^3, got {q!r}")
-        self.task, self.q, self.trilaterates = task, float(density), trilaterate
+        require_target(task)
+        density = density_of(task, q)
+        self.task, self.q, self.trilaterates = task, density, trilaterate
         position, velocity = task.prior_sigma
         prior = Restart(task.prior_velocity, (position,) * 3 + (velocity,) * 3)
         data = FilterData(self.q, task.dt, task.layout.comm_size, MAX_RATIO)
@@ -123,6 +103,71 @@ class TargetEstimator:
             raise not_finite(obs, code, self.task.layout.slices)
         return Filtered(parts, first, filters, reports, self.trilaterates)
 
+    def take_over(self, filters: Array) -> Array:
+        """The memories after their mean and covariance were fused: nothing else depends on them."""
+        return filters
+
+
+AgentFilters: TypeAlias = TargetEstimator | OwnEstimator
+
+
+def require_target(task: TeamTask) -> None:
+    """Check that there is something to estimate.
+
+    Raises:
+        ValueError: If there is not.
+    """
+    if not task.layout.target:
+        raise ValueError(
+            f"there is no target to estimate in {task.env_id!r} (mission {task.mission!r}); take "
+            "quad/TargetTracking-v0 or quad/CooperativeEstimation-v0"
+        )
+
+
+def density_of(task: TeamTask, q: Any) -> float:
+    """The density of the target's acceleration, m^2/s^3; None: that of the mission.
+
+    Raises:
+        ValueError: If it is not a finite number >= 0.
+    """
+    density = DEFAULT_Q[task.mission] if q is None else q
+    if isinstance(density, bool) or not isinstance(density, int | float | np.integer | np.floating):
+        raise ValueError(f"q must be a number, m^2/s^3, got {q!r}")
+    if not 0.0 <= density < np.inf:
+        raise ValueError(f"q must be finite and >= 0 m^2/s^3, got {q!r}")
+    return float(density)
+
+
+def make_estimator(task: TeamTask, estimator: Any = None, q: Any = None) -> AgentFilters:
+    """The filters of agents.
+
+    Args:
+        task: With a target.
+        estimator: "ekf" (None), "trilateration", "polar-ekf" (a point mass of constant speed, climb and
+            course), "random-walk" (the text's three states), or an object with the members of
+            `controllers.estimation.Estimator`.
+        q: Of the target's motion; None for the usual: a density of its acceleration, m^2/s^3; for "polar-ekf"
+            three, of V', gamma' and chi'; for "random-walk" one of its velocity, m^2/s.
+
+    Raises:
+        ValueError: If the task has no target, there is no such estimator, or q does not belong to it.
+    """
+    require_target(task)
+    if estimator is None or estimator in ("ekf", "trilateration"):
+        return TargetEstimator(task, q, trilaterate=estimator == "trilateration")
+    usual = density_of(task, None)
+    if estimator == "polar-ekf":
+        if q is not None and np.shape(q) != (3,):
+            raise ValueError(f"q of 'polar-ekf' must be three densities, of V', gamma' and chi', got {q!r}")
+        return OwnEstimator(task, PolarEstimator() if q is None else PolarEstimator(tuple(q)), usual)
+    if estimator == "random-walk":
+        return OwnEstimator(task, RandomWalkEstimator() if q is None else RandomWalkEstimator(q), usual)
+    if isinstance(estimator, str):
+        raise ValueError(f"{unknown_name('estimator', estimator, get_args(EstimatorName))}, or an object")
+    if q is not None:
+        raise ValueError(f"q = {q!r} belongs to the named estimators: give it to {estimator!r} itself")
+    return OwnEstimator(task, estimator, usual)
+
 
 def shared_estimates(blocks: Array) -> Estimates:
     """The own estimates in the block of the estimate wrapper.
@@ -151,13 +196,13 @@ class EstimatorPolicy(TeamPolicy):
     Args:
         task: Of the mission "estimation".
         name: For tables.
-        q: See `TargetEstimator`.
-        trilaterate: See there.
+        estimator: See `make_estimator`.
+        q: See there.
     """
 
-    def __init__(self, task: TeamTask, name: str, q: float | None, trilaterate: bool) -> None:
-        super().__init__(task, name, FILTER_SIZE)
-        self.estimator = TargetEstimator(task, q, trilaterate)
+    def __init__(self, task: TeamTask, name: str, estimator: Any, q: Any) -> None:
+        self.estimator = make_estimator(task, estimator, q)
+        super().__init__(task, name, self.estimator.size)
 
     def _decide(self, obs: Actions, state: PolicyState, start: Flags) -> tuple[Actions, PolicyState]:
         done = self.estimator.step(obs, state.memory, start)
@@ -174,11 +219,18 @@ class EkfPolicy(EstimatorPolicy):
 
     Args:
         task: What is known of the scene.
-        q: Density of the target's acceleration, m^2/s^3; None: 0.02.
+        q: Of the target's motion, see `make_estimator`; None: 0.02 m^2/s^3 with the model "cv".
+        model: Of the target: "cv" (constant velocity), "aircraft" (a point mass of constant speed, climb and
+            course, 6.2.2), "random-walk" (the three states of 6.2.1).
+
+    Raises:
+        ValueError: If there is no such model, or q does not belong to it.
     """
 
-    def __init__(self, task: TeamTask, q: float | None = None) -> None:
-        super().__init__(task, "ekf", q, trilaterate=False)
+    def __init__(self, task: TeamTask, q: Any = None, *, model: Model = "cv") -> None:
+        if model not in _MODELS:
+            raise ValueError(unknown_name("model", model, _MODELS))
+        super().__init__(task, "ekf", _MODELS[model], q)
 
 
 class TrilaterationPolicy(EstimatorPolicy):
@@ -193,7 +245,7 @@ class TrilaterationPolicy(EstimatorPolicy):
     """
 
     def __init__(self, task: TeamTask, q: float | None = None) -> None:
-        super().__init__(task, "trilateration", q, trilaterate=True)
+        super().__init__(task, "trilateration", "trilateration", q)
 
 
 class SharedEstimatePolicy(TeamPolicy):

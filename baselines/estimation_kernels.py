@@ -74,13 +74,19 @@ def _begin(slot: Array, prior: Array, x: Array, covariance: Array) -> None:
 
 
 @kernel
+def _way(motion: Array, memory: Array, dt: float, a: int) -> float:
+    """Component a of the vehicle's way in one period, by the corrected trapezoid of its velocity."""
+    mean = 0.5 * (memory[_VELOCITY + a] + motion[a])
+    turn = (memory[_ACCELERATION + a] - motion[3 + a]) / 12.0
+    return float(dt * (mean + dt * turn))
+
+
+@kernel
 def _follow(motion: Array, memory: Array, data: FilterData, x: Array, covariance: Array) -> None:
-    """Predict by one period, then follow the vehicle, by the corrected trapezoid of its velocity."""
+    """Predict by one period, then follow the vehicle."""
     predict_kernel(x, covariance, data.dt, data.q)
     for a in range(3):
-        mean = 0.5 * (memory[_VELOCITY + a] + motion[a])
-        turn = (memory[_ACCELERATION + a] - motion[3 + a]) / 12.0
-        x[a] -= data.dt * (mean + data.dt * turn)
+        x[a] -= _way(motion, memory, data.dt, a)
 
 
 @kernel
@@ -298,3 +304,36 @@ def decode_and_filter(
             reports[j], prior, sigma, rows, coefficients, limits, data, valid, scratch,
         )  # fmt: skip
     return bad
+
+
+@kernel
+def gather_rows(
+    plants: Array,
+    disturbances: Array,
+    comms: Array,
+    measured: Array,
+    memory: Array,
+    coefficients: Array,
+    data: FilterData,
+    way: Array,
+    z: Array,
+    place: Array,
+    age: Array,
+    valid: NDArray[np.bool_],
+    held: Counts,
+) -> None:
+    """What a filter of the user's is given: ways (n, 3), and the measurements held with their places.
+
+    Arguments up to `data` as in `filter_row`, for n rows; the own motion in the memory (n, >= FILTER_SIZE) is
+    brought up to date, and the way is zero in rows that begin an episode.
+    """
+    n, m = valid.shape
+    for j in range(n):
+        comm = comms[j].reshape(comms.shape[1] // data.message, data.message)
+        motion = memory[j, _VELOCITY:FILTER_SIZE].copy()
+        _own_motion(plants[j], disturbances[j], coefficients, motion)
+        for a in range(3):
+            way[j, a] = _way(motion, memory[j], data.dt, a) if memory[j, STAGE] > 0.0 else 0.0
+        for a in range(6):
+            memory[j, _VELOCITY + a] = motion[a]
+        held[j] = _gather(comm, measured[j].reshape(m, N_MEASURED), z[j], place[j], age[j], valid[j])

@@ -257,7 +257,7 @@ def test_options_of_every_policy_are_known():
 
 
 @pytest.mark.parametrize(
-    ("name", "own"), [("consensus-mpc", {}), ("cooperative-mpc", {"reach", "q", "estimates"})]
+    ("name", "own"), [("consensus-mpc", {}), ("cooperative-mpc", {"reach", "q", "estimates", "estimator"})]
 )
 def test_the_options_of_a_policy_have_the_defaults_of_its_controller(name, own):
     of_controller = inspect.signature(CooperativeMpc).parameters
