@@ -365,7 +365,8 @@ def solve_row(
         )  # fmt: skip
         iterations += count
         if status == OPTIMAL:
-            pack_working_set(ws.state[:n_rows], stage, ws.active, s.working)
+            if warm or iterations > 0:
+                pack_working_set(ws.state[:n_rows], stage, ws.active, s.working)
             return level, iterations
         if level == CLIPPED_SDRE:
             return HOVER, iterations

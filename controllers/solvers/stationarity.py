@@ -6,6 +6,8 @@ that only round-off of one kind makes stationary is found out.
 
 from __future__ import annotations
 
+import math
+
 from quad_envs._numba import kernel
 from quad_envs.parameters import Array
 
@@ -14,6 +16,43 @@ from .active_set import RowData
 
 REFINED = 1e-9  # relative stationarity above which a solution is refined once
 STATIONARY = 1e-8  # and above which it is not called optimal: 1e-6 less what another order of summation adds
+_MILD = 1e7  # times round-off this is `REFINED`
+
+
+@kernel
+def is_mild(A: Array, R: Array, Q_f: Array, horizon: int, scratch: Array) -> bool:
+    """Whether round-off cannot spoil an unconstrained optimum: it grows by |A_i| .. |A_0| in the states.
+
+    The gradient sees the square of that growth, times the largest weight over the smallest.
+
+    Args:
+        A: (1 or N, 12, 12).
+        R: (4, 4).
+        Q_f: (12, 12), the largest weight of a state.
+        horizon: N.
+        scratch: Overwritten, (>= 2, 12).
+    """
+    n = A.shape[1]
+    for a in range(n):
+        scratch[0, a] = 1.0
+    growth = 1.0
+    for i in range(horizon):
+        w, w_next = scratch[i % 2], scratch[1 - i % 2]
+        pair = A[i if A.shape[0] > 1 else 0]
+        for a in range(n):
+            w_next[a] = 0.0
+        for b in range(n):
+            factor = w[b]
+            for a in range(n):
+                w_next[a] += factor * abs(pair[b, a])
+        for a in range(n):
+            growth = max(growth, w_next[a])
+    largest, smallest = 0.0, math.inf
+    for a in range(n):
+        largest = max(largest, Q_f[a, a])
+    for a in range(R.shape[0]):
+        smallest = min(smallest, R[a, a])
+    return growth * growth * max(largest, smallest) <= _MILD * smallest
 
 
 @kernel

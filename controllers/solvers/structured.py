@@ -38,7 +38,7 @@ from .active_set import (
     worst_row,
 )
 from .solution import Multipliers, Solution, Status
-from .stationarity import REFINED, STATIONARY, lagrangian_gradient
+from .stationarity import REFINED, STATIONARY, is_mild, lagrangian_gradient
 from .working_set import correct, start_from_guess
 
 ITERATION_LIMIT = 0  # stands for a limit that grows with the problem, `step_limit`
@@ -402,6 +402,8 @@ def solve_structured(
         if not (finite and _all_finite(u) and _all_finite(x)):
             return NOT_FINITE, iterations
         if attempt == 0 and worst_row(u, x, rows, ws.state)[0] < 0:
+            if is_mild(A, R, Q_f, N, ws.scratch[1]):
+                return OPTIMAL, 0
             relative = lagrangian_gradient(
                 A,
                 B,
