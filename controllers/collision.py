@@ -11,11 +11,11 @@ exactly symmetric meeting. Rows are soft: dense traffic makes hard ones contradi
 
 Violated rows pull at the rotors with their weight times the authority of a rotor (0.05 m/N on a braking row
 of 0.25 s: 50 per N with a weight of 1e3), against a curvature of some 20 per N^2. So a plan has a tilt limit
-of its own (`plan_tilt`, 0.7 rad; with 0.5 rad two vehicles that meet at 2 m/s each turn too late), and the
+of its own (`plan_tilt`, 0.5 rad; with alpha = 1/2 two vehicles that meet at 2 m/s each need 0.7 rad), and the
 predicted velocity turns with the attitude (`turning_velocity`): otherwise rows push a climbing vehicle the
 wrong way. Smallest distances, m, by the weight: 20 vehicles through one centre at 1 m/s each (16 flights;
-how many of them are below 0.40), pairs that meet at 2 m/s each (20), lattices of 100 vehicles (8, none
-crashes):
+how many of them are below 0.40), pairs that meet at 2 m/s each (20; alpha = 1/2, 0.7 rad), lattices of 100
+vehicles (8, none crashes):
 
 | weight | 30 | 100 | 300 | 1e3 | 3e3 | 1e4 |
 |---|---|---|---|---|---|---|

@@ -80,7 +80,8 @@ class CooperativeMpc:
         separation_weight: Penalty per metre of a separation row; `collision.py` says why not more.
         separation_margin: What the plan keeps beyond the separation, m.
         plan_tilt: Largest roll and pitch of a plan, rad, besides the task's limit; inf for none. Rows that
-            push a vehicle upside down push it to where its model holds no longer.
+            push a vehicle upside down push it to where its model holds no longer. With alpha = 1/2 vehicles
+            that meet at 2 m/s each need 0.7.
         turning: Whether predicted positions follow the velocity as the predicted attitude turns it; the
             dissertation's keep the present R_BI.
         soft_weight: Exact penalty per unit of the other state rows; inf makes them hard.
@@ -114,7 +115,7 @@ class CooperativeMpc:
         swirl: float = math.radians(5.0),
         separation_weight: float = 1e3,
         separation_margin: float = 0.03,
-        plan_tilt: float = 0.7,
+        plan_tilt: float = 0.5,
         turning: bool = True,
         soft_weight: float = 1e3,
         margin: float = 0.02,

@@ -91,7 +91,8 @@ def test_a_formation_closes_from_a_line_with_crossing_paths(slots, G, path, sett
 @pytest.mark.parametrize("alpha", [0.5, 1.0])
 @pytest.mark.parametrize("speed", [0.5, 1.0, 2.0])
 def test_vehicles_that_meet_head_on_keep_the_separation_and_arrive(speed, alpha):
-    controller = CooperativeMpc(PAIR, alpha=alpha, **FREE)
+    # With alpha = 1/2 the model sees half of what a tilt does, and needs more of it at 2 m/s each.
+    controller = CooperativeMpc(PAIR, alpha=alpha, plan_tilt=0.7 if alpha == 0.5 else 0.5, **FREE)
     meetings = [swap_antipodes(controller, speed, seed=seed) for seed in range(8)]
     assert min(meeting.gap for meeting in meetings) >= 0.399
     assert max(meeting.end for meeting in meetings) < 0.4  # 3 s after the end of the reference
@@ -223,7 +224,7 @@ def test_nobody_in_a_crowd_of_a_hundred_tumbles(seed):
         tilt = max(tilt, np.abs(env.unwrapped.plants[:, 6:8]).max())
         gap = min(gap, *(info["min_separation"] for info in infos.values()))
     assert not any(crashed.values())
-    assert tilt < np.radians(40.0)  # measured 23 to 28 degrees: the flight is chaotic
+    assert tilt < np.radians(40.0)  # measured 23 to 35 degrees: the flight is chaotic
     assert gap >= 0.38  # soft rows; measured 0.398 to 0.408 m
     assert not state.fallbacks[:, 1:].any()
 

@@ -110,7 +110,7 @@ def meet(
         runs: Seeds 0, 1, ...
         jitter: Standard deviation of the starts, m.
     """
-    options = {"reach": np.inf, "speed": np.inf, "alpha": 0.5, **options}
+    options = {"reach": np.inf, "speed": np.inf, "alpha": 0.5, "plan_tilt": 0.7, **options}
     horizon = options.get("horizon", _HORIZON)
     controller = CooperativeMpc(team_task(vehicles, horizon), **options)
     angle = np.arange(vehicles) * 2.0 * np.pi / vehicles
