@@ -46,7 +46,9 @@ class Solution(NamedTuple):
 class Residuals(NamedTuple):
     """How far a solution is from the optimality conditions; all zero at the optimum."""
 
-    stationarity: float  # gradient of the Lagrangian over 1 + |gradient of the cost at u = 0|, largest entry
+    stationarity: (
+        float  # gradient of the Lagrangian over 1 + (the cost's at u = 0 or the rows' pull), largest
+    )
     primal: float  # largest violation of a hard row, and largest gap in the dynamics
     multiplier_bounds: float  # how far multipliers leave [0, weight], scaled as stationarity
     complementarity: float  # largest |lambda - clip(lambda - slack, 0, weight)|
@@ -69,12 +71,14 @@ def residuals(qp: OcpQp, solution: Solution) -> Residuals:
     weights = (hard_inputs,) * 4 + (rows.weight,) * 2
     pull = multipliers.row_lower - multipliers.row_upper
     gradient = _gradient(qp, u, states, pull)
+    no_pull = np.zeros_like(pull)
+    pulled = float(np.abs(gradient - _gradient(qp, u, states, no_pull)).max())
     gradient -= multipliers.box_lower - multipliers.box_upper
     rate = multipliers.rate_lower - multipliers.rate_upper
     gradient -= rate
     gradient[:-1] += rate[1:]
     zero = np.zeros_like(u)
-    scale = 1.0 + float(np.abs(_gradient(qp, zero, _roll_out(qp, zero), np.zeros_like(pull))).max())
+    scale = 1.0 + max(pulled, float(np.abs(_gradient(qp, zero, _roll_out(qp, zero), no_pull)).max()))
     primal = float(np.abs(solution.x - states).max())
     bounds = 0.0
     complementarity = 0.0
