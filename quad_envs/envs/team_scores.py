@@ -158,8 +158,8 @@ def judge_team(
             anybody = anybody or row[CRASHED] > 0.0
         else:  # it left in an earlier step, and nothing counts any more
             row[REWARD], row[STAGE_COST], row[COST], row[VIOLATED], row[LEFT] = 0.0, 0.0, 0.0, 0.0, 1.0
-            for k in range(TERMS, TERMS + N_LOSS + int(team[N_VALUES])):
-                row[k] = 0.0
+            for entry in range(TERMS, TERMS + N_LOSS + int(team[N_VALUES])):
+                row[entry] = 0.0
     for i in range(n):
         row = rows[first + i]
         if anybody and team[WHOLE_TEAM] > 0.0:
