@@ -110,7 +110,7 @@ def test_csv_is_reproduced_at_its_lines_and_rests_after_its_end(tmp_path):
     ("text", "message"),
     [
         ("t,x,y\n0,0,0\n1,0,0\n", "missing \\['z'\\]"),
-        ("t,x,y,z,w\n0,0,0,0,0\n1,0,0,0,0\n", "unknown \\['w'\\]"),
+        ("t,x,y,w\n0,0,0,0\n1,0,0,0\n", "unknown: 'w'"),
         ("t,x,y,z\n0,0,0,0\n0.1,nan,0,0\n", "line 3: x must be a finite number, got 'nan'"),
         ("t,x,y,z\n0,0,0,0\n0.1,,0,0\n", "line 3: x must be a finite number, got ''"),
         ("t,x,y,z\n0,0,0,0\n0.1,0,0\n", "line 3: 3 cells"),

@@ -13,7 +13,7 @@ from .._numba import entry_of
 from ..disturbances import Disturbance
 from ..observations import N_REFERENCE
 from ..parameters import N_STATE, POSITION, Array
-from ..references import Reference, make_reference
+from ..references import Reference, make_reference, state_on
 from .kernel import (
     COEFFICIENTS,
     COMMAND,
@@ -113,6 +113,8 @@ class TrackingBatch:
         if self._random[2]:
             rng.standard_normal(out=self.noises[i])
             self.noises[i] *= self._noise
+        if self.options.starts_on_reference and start is None:
+            row[:N_STATE] += state_on(self.reference(i)[0])
         distance = float(np.linalg.norm(row[POSITION] - self.references[self.which[0, i], 0, POSITION]))
         if distance > self.options.lost_distance:
             raise ValueError(

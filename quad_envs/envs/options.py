@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
+from ..names import shown
 from ..observations import TrackingLayout
 from ..parameters import N_STATE, Array
-from ..references import Reference, make_reference
+from ..references import ReferenceLike
 from ..tasks import Task
 from .vehicle_options import CRASH_TILT, VehicleOptions, is_number
 
@@ -21,20 +23,30 @@ class TrackingOptions(VehicleOptions):
     kind: ClassVar[str] = "a tracking"
 
     env_id: str = "quad/Tracking-v0"
-    reference: str | Reference = "setpoint"
-    start: tuple[float, ...] = (0.0, 0.0, 0.0)
+    reference: ReferenceLike = "setpoint"  # afterwards what is flown
+    start: str | tuple[float, ...] = (0.0, 0.0, 0.0)
     start_box: float | tuple[float, ...] = 1.0
     preview: int = 25
     lost_distance: float = 50.0
     task: Task = field(init=False, repr=False, compare=False)  # made from the rest
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "reference", self.take_reference(self.reference))
         VehicleOptions.__post_init__(self)
         self.require_positive("lost_distance")
         self.require_whole("preview", 0)
         object.__setattr__(self, "task", self._make_task())
         self.start_state()
-        make_reference(self.reference)
+
+    @classmethod
+    def that_follow(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        """A start on the reference is exactly there."""
+        return {"start_box": 0.0} if _is_reference(values.get("start")) else {}
+
+    @property
+    def starts_on_reference(self) -> bool:
+        """Whether the start box is around the reference's first row."""
+        return _is_reference(self.start)
 
     def _make_task(self) -> Task:
         """The task that follows from the options."""
@@ -47,13 +59,18 @@ class TrackingOptions(VehicleOptions):
         return Task(layout=layout, **known)
 
     def start_state(self) -> Array:
-        """Middle of the start box, (12,)."""
+        """Middle of the start box, (12,), or zero where it is on the reference."""
+        if self.starts_on_reference:
+            return np.zeros(N_STATE)
         if (
             not isinstance(self.start, tuple)
             or len(self.start) not in (3, N_STATE)
             or not all(map(is_number, self.start))
         ):
-            raise ValueError(f"start must be 3 (position) or 12 (state) finite numbers, got {self.start!r}")
+            raise ValueError(
+                "start must be 3 (position) or 12 (state) finite numbers or 'reference', "
+                f"got {shown(self.start)}"
+            )
         state = np.zeros(N_STATE)
         state[: len(self.start)] = self.start
         tilt, width = np.abs(state[6:8]), self.start_half_widths()[6:8]
@@ -72,3 +89,7 @@ class TrackingOptions(VehicleOptions):
         out = np.zeros(N_STATE)
         out[: len(widths)] = widths
         return out
+
+
+def _is_reference(start: object) -> bool:
+    return isinstance(start, str) and start == "reference"

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from ..disturbances import Disturbance
+from ..names import shown
 from ..observations import N_REFERENCE
 from ..parameters import Array
-from ..references import Reference
+from ..references import Reference, too_fast
 from ..tasks import BaseTask
 
 
@@ -22,9 +23,13 @@ def reference_rows(reference: Reference, times: Array, rng: np.random.Generator)
     """Reference rows at times (n,), (n, 8).
 
     Raises:
-        ValueError: If the reference gives another shape or a number that is not finite.
+        ValueError: If the reference gives another shape or a number that is not finite, or is too fast.
     """
-    return checked_rows("reference", reference, reference.rows(times, rng), times, N_REFERENCE)
+    rows = checked_rows("reference", reference, reference.rows(times, rng), times, N_REFERENCE)
+    said = too_fast(rows[:, 3:6], times)
+    if said:
+        raise ValueError(f"reference {shown(reference)} {said}")
+    return rows
 
 
 def checked_rows(kind: str, source: object, rows: Any, times: Array, width: int) -> Array:
@@ -36,11 +41,11 @@ def checked_rows(kind: str, source: object, rows: Any, times: Array, width: int)
     found = np.asarray(rows, dtype=np.float64)
     if found.shape != (times.size, width):
         raise ValueError(
-            f"{kind} {source!r} must give rows of shape {(times.size, width)}, got {found.shape}"
+            f"{kind} {shown(source)} must give rows of shape {(times.size, width)}, got {found.shape}"
         )
     if not np.isfinite(found).all():
         k = int(np.argmin(np.isfinite(found).all(axis=1)))
-        raise ValueError(f"{kind} {source!r} is not finite at t = {times[k]:g} s")
+        raise ValueError(f"{kind} {shown(source)} is not finite at t = {times[k]:g} s")
     return found
 
 
@@ -53,11 +58,12 @@ def disturbance_rows(disturbance: Disturbance, nodes: Array, dt: float, rng: np.
     rows = np.asarray(disturbance.values(nodes, rng), dtype=np.float64)
     if rows.shape != (*nodes.shape, 6):
         raise ValueError(
-            f"disturbance {disturbance!r} must give values of shape {(*nodes.shape, 6)}, got {rows.shape}"
+            f"disturbance {shown(disturbance)} must give values of shape {(*nodes.shape, 6)}, "
+            f"got {rows.shape}"
         )
     if not np.isfinite(rows).all():
         k = int(np.argmin(np.isfinite(rows).all(axis=(1, 2))))
-        raise ValueError(f"disturbance {disturbance!r} is not finite at t = {k * dt:g} s")
+        raise ValueError(f"disturbance {shown(disturbance)} is not finite at t = {k * dt:g} s")
     return rows
 
 

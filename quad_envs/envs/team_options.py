@@ -22,7 +22,7 @@ from ..graphs import (
     toward_leader,
 )
 from ..parameters import Array, QuadrotorParams
-from ..references import Reference, make_reference
+from ..references import Reference, ReferenceLike
 from ..sensors import sensor_rows
 from ..targets import Target, make_target
 from ..tasks import TeamTask
@@ -84,9 +84,7 @@ class TeamOptions(VehicleOptions):
     task: TeamTask = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        if self.max_cycles is not None:
-            self.require_whole("max_cycles", 1)
-            object.__setattr__(self, "time_limit", self.max_cycles * self.dt)
+        self.take_cycles()
         VehicleOptions.__post_init__(self)
         self.require_whole("vehicles", 2, MOST_VEHICLES)
         self.require_whole("delay", 0)
@@ -114,6 +112,13 @@ class TeamOptions(VehicleOptions):
         object.__setattr__(self, "graphs", self._make_graphs())
         object.__setattr__(self, "task", self._make_task())
         self.check_start()
+
+    def take_cycles(self) -> None:
+        """The time limit of PettingZoo's `max_cycles`."""
+        if self.max_cycles is not None:
+            self.require_whole("max_cycles", 1)
+            self.require_positive("dt")
+            object.__setattr__(self, "time_limit", self.max_cycles * self.dt)
 
     @classmethod
     def that_follow(cls, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -241,11 +246,12 @@ class FormationOptions(TeamOptions):
     has_leader: ClassVar[bool] = True
 
     env_id: str = "quad/Formation-v0"
-    reference: str | Reference = "line"
+    reference: ReferenceLike = "line"  # afterwards what is flown
 
     def __post_init__(self) -> None:
+        self.take_cycles()
+        object.__setattr__(self, "reference", self.take_reference(self.reference))
         TeamOptions.__post_init__(self)
-        make_reference(self.reference)
 
     def make_slots(self) -> Array:
         """Wanted positions relative to the leader's, (N, 3), m."""
@@ -288,8 +294,9 @@ class TargetTrackingOptions(TeamOptions):
             object.__setattr__(self, name, values)
         self._warn_of_narrow_prior()
         sensor_rows(self.sensor)
-        make_target(self.target)
+        target = make_target(self.target)
         TeamOptions.__post_init__(self)
+        object.__setattr__(self, "target", self.within_episode(target))
 
     def make_slots(self) -> Array:
         """Wanted positions relative to the target, (N, 3), m."""

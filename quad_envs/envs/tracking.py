@@ -64,9 +64,10 @@ class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     rotor), `rate_limit` N/s per rotor,
         `tilt_limit` rad on |roll| and |pitch|, `velocity_limit` m/s on each body velocity, `position_limit`
         ((x, y, z) lower, (x, y, z) upper) m. No limit but kappa by default.
-    Task: `reference` (a name, a .csv path or a Reference), `start` (3 or 12 numbers), `start_box` (half
-    widths: 1 or 3
-        numbers of the position or 12 of the state), `time_limit` 10 s, `dt` 0.05 s, `substeps` 5, `preview`
+    Task: `reference` (a name, the path of a table or a Reference), `start` (3 or 12 numbers, or "reference":
+        on it, with its velocity and heading), `start_box` (half widths: 1 or 3 numbers of the position or 12
+        of the state; 1 m, on the reference 0), `time_limit` 10 s (or "reference": as long as that is given),
+        `dt` 0.05 s, `substeps` 5, `preview`
         25 stages of the reference in the observation, `Q` and `R` (diagonals, 1), `reward` "bounded" or
         "quadratic", `lost_distance` 50 m.
     Uncertainty: `disturbance` (a name, a Disturbance or None), `reveal_disturbance` (puts its mean over the

@@ -11,8 +11,9 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 
 from ..disturbances import Disturbance, beyond_authority, disturbance_of
-from ..names import suggestion
+from ..names import shown, suggestion
 from ..parameters import N_INPUT, N_STATE, Limits, QuadrotorParams, Weights
+from ..references import Reference, in_episode, length_of, make_reference, mismatch
 from ..vehicles import vehicle_values
 
 # Arguments that are one number; what it may be is checked where it is used.
@@ -62,7 +63,7 @@ class VehicleOptions:
     def __post_init__(self) -> None:
         for name in _NUMBERS:
             if not isinstance(getattr(self, name), int | float | np.integer | np.floating):
-                raise ValueError(f"{name} must be a number, got {getattr(self, name)!r}")
+                raise ValueError(f"{name} must be a number, got {shown(getattr(self, name))}")
         vehicle_values(self.vehicle)
         for name in ("dt", "time_limit"):
             self.require_positive(name)
@@ -100,6 +101,29 @@ class VehicleOptions:
         excess = beyond_authority(self.make_disturbance(), self.make_params(), self.make_limits())
         if excess:
             warnings.warn(excess, stacklevel=2)
+
+    def take_reference(self, what: object) -> Reference:
+        """The reference within these episodes; a time limit that follows from it is set.
+
+        Raises:
+            ValueError: If it is no reference, or nothing of it is flown.
+        """
+        made = make_reference(what)
+        if isinstance(self.time_limit, str) and self.time_limit == "reference":
+            self.require_positive("dt")
+            object.__setattr__(self, "time_limit", length_of(made, self.dt))
+        for name in ("dt", "time_limit"):
+            self.require_positive(name)
+        fitted: Reference = self.within_episode(made)
+        return fitted
+
+    def within_episode(self, trajectory: Any) -> Any:
+        """A reference or target as it is in these episodes; a warning says if it does not fit them."""
+        fitted = in_episode(trajectory, self.dt, self.time_limit)
+        said = mismatch(fitted, self.dt, self.time_limit)
+        if said:
+            warnings.warn(said, stacklevel=2)
+        return fitted
 
     def require_positive(self, name: str) -> None:
         """Check that a field is a finite number > 0.
