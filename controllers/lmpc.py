@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from quad_envs._numba import kernel
 from quad_envs.parameters import Array
@@ -13,7 +14,7 @@ from quad_envs.tasks import Task
 from .controller import first_non_finite
 from .disturbance import ESTIMATOR_GAIN
 from .model import hover_pair
-from .mpc import Frame, Mpc, MpcOptions, Problem, SolverName, VelocityReference
+from .mpc import SOFT_WEIGHT, Frame, Mpc, MpcOptions, Problem, SolverName, VelocityReference
 from .mpc_kernels import MpcData, Scratch, begin_row, carve, end_row, hold_trim, solve_row
 from .ocp import IntArray
 from .solvers.structured import ITERATION_LIMIT, Workspace
@@ -32,6 +33,7 @@ def _decide_rows(
     which: IntArray | None,
     A: Array,
     B: Array,
+    stationary: bool,
     data: MpcData,
     buffer: Array,
     ws: Workspace,
@@ -47,7 +49,7 @@ def _decide_rows(
         begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
         hold_trim(A, s.trim, s.c)
         has_plan = memories[j, 0] > 0.0
-        level, iterations = solve_row(A, B, data.Q, data.P, True, s.r, has_plan, H, K, data, s, ws)
+        level, iterations = solve_row(A, B, data.Q, data.P, stationary, s.r, has_plan, H, K, data, s, ws)
         end_row(level, plants[j], lasts[j], disturbances[j], memories[j], data, s, ws.u, commands[j], kept[j])
         report[0, j], report[1, j] = level, iterations
     return bad
@@ -73,6 +75,9 @@ class LinearMPC(Mpc):
         reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
         estimator_gain: Share of each new residual in the estimate, in (0, 1].
         iteration_limit: Largest number of active-set steps of a solve; 0 for one that grows with it.
+        Q: Weight of the state, a number, the diagonal (12,) or a matrix; the reward's by default.
+        R: Weight of the rotor forces, a number, the diagonal (4,) or a matrix; the reward's by default.
+        terminal: Factor of P, the weight of x_N, or a matrix (12, 12) in its place.
 
     Raises:
         ValueError: If an option is not allowed.
@@ -86,11 +91,14 @@ class LinearMPC(Mpc):
         solver: SolverName = "structured",
         frame: Frame = "heading",
         velocity_reference: VelocityReference = "attitude",
-        soft_weight: float = 1e3,
+        soft_weight: float = SOFT_WEIGHT,
         margin: float = 0.02,
         reject_disturbance: bool = False,
         estimator_gain: float = ESTIMATOR_GAIN,
         iteration_limit: int = ITERATION_LIMIT,
+        Q: ArrayLike | None = None,
+        R: ArrayLike | None = None,
+        terminal: ArrayLike = 1.0,
     ) -> None:
         options = MpcOptions(
             solver,
@@ -101,6 +109,9 @@ class LinearMPC(Mpc):
             reject_disturbance,
             estimator_gain,
             iteration_limit,
+            Q,
+            R,
+            terminal,
         )
         super().__init__(task, horizon, options, pairs=1, guess=False)
         A, B = hover_pair(task.params, task.dt)
@@ -108,9 +119,18 @@ class LinearMPC(Mpc):
 
     def _decide_rows(self, *arrays: Any) -> int:
         which, buffer, ws = self._scratch()
-        arguments: tuple[Any, ...] = (*arrays, which, self._A, self._B, self._data, buffer, ws)
+        arguments: tuple[Any, ...] = (
+            *arrays,
+            which,
+            self._A,
+            self._B,
+            not self._own_terminal,
+            self._data,
+            buffer,
+            ws,
+        )
         return _decide_rows(*arguments)
 
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
         hold_trim(self._A, s.trim, s.c)
-        return Problem(self._A, self._B, self._data.Q, self._data.P, True, s.r)
+        return Problem(self._A, self._B, self._data.Q, self._data.P, not self._own_terminal, s.r)

@@ -31,10 +31,12 @@ from .ocp import IntArray, OcpQp, StateRows, no_rows, output_rows
 from .riccati import dare
 from .solvers import Backend, Status, StructuredSolver
 from .solvers.structured import Workspace, make_workspace
+from .weights import require_turnable, terminal_weight, weight_matrix
 
 SolverName = Literal["structured", "osqp"]
 Frame = Literal["heading", "hover"]
 VelocityReference = Literal["heading", "attitude"]
+SOFT_WEIGHT = 25.0  # per SI unit: keeps the corridor's limits; from 30 on, 3 m outside walls, some flip
 
 
 def require_choice(name: str, value: object, kind: Any) -> None:
@@ -63,6 +65,9 @@ class MpcOptions:
     reject_disturbance: bool
     estimator_gain: float
     iteration_limit: int
+    Q: ArrayLike | None = None  # weight of the state: number, diagonal (12,) or matrix; None: the reward's
+    R: ArrayLike | None = None  # weight of the forces: number, diagonal (4,) or matrix; None: the reward's
+    terminal: ArrayLike = 1.0  # factor of P, the weight of x_N, or a matrix (12, 12) in the problem's axes
 
     def __post_init__(self) -> None:
         require_choice("solver", self.solver, SolverName)
@@ -116,19 +121,19 @@ def limit_rows(limits: Limits, margin: float, weight: float, horizon: int) -> tu
 
 def mpc_data(task: BaseTask, horizon: int, options: MpcOptions) -> MpcData:
     """The constants of a controller."""
-    params, Q, R = task.params, task.weights.Q_matrix(), task.weights.R_matrix()
-    if options.frame == "heading" and Q[0, 0] != Q[1, 1]:
-        raise ValueError(
-            f"frame 'heading' needs equal weights on x and y, got {Q[0, 0]} and {Q[1, 1]}; use frame='hover'"
-        )
-    A, B = hover_pair(params, task.dt)
+    params = task.params
+    Q = weight_matrix("Q", task.weights.Q if options.Q is None else options.Q, N_STATE, definite=False)
+    R = weight_matrix("R", task.weights.R if options.R is None else options.R, N_INPUT, definite=True)
+    P = terminal_weight(options.terminal, dare(*hover_pair(params, task.dt), Q, R))
+    if options.frame == "heading":
+        require_turnable(Q)
     rows, axis = limit_rows(task.limits, options.margin, options.soft_weight, horizon)
     return MpcData(
         coefficients=params.coefficients(),
         B_c=params.input_matrix(),
         Q=np.ascontiguousarray(Q[None]),
         R=R,
-        P=dare(A, B, Q, R),
+        P=P,
         normals=rows.normals,
         axis=axis,
         normal=rows.normal,
@@ -168,6 +173,11 @@ class Mpc(ABC):
         self.memory_size = self._keep_from + (1 + N_STATE * (self.horizon + 1) if guess else 0)
         self._workspace: tuple[IntArray | None, Array, Workspace] | None = None
         self._backend: Backend | None = None
+
+    @property
+    def _own_terminal(self) -> bool:
+        """Whether the terminal weight is not the one that makes the Riccati recursion stationary."""
+        return np.ndim(self.options.terminal) > 0 or self.options.terminal != 1.0
 
     def decide(
         self,

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+from numpy.typing import ArrayLike
+
 from quad_envs._numba import kernel
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 from quad_envs.rotations import sincos, wrap_angle_scalar
@@ -19,7 +21,7 @@ from .disturbance import ESTIMATOR_GAIN
 from .fallback import RELAXED
 from .linalg import copy, fill
 from .model import RK4_SCRATCH, rk4_sensitivities, rotated_derivatives
-from .mpc import Frame, Mpc, MpcOptions, Problem, SolverName, require_choice
+from .mpc import SOFT_WEIGHT, Frame, Mpc, MpcOptions, Problem, SolverName, require_choice
 from .mpc_kernels import MpcData, Scratch, begin_row, carve, copy_vector, end_row, solve_row
 from .ocp import IntArray
 from .solvers.structured import ITERATION_LIMIT, Workspace
@@ -242,6 +244,9 @@ class ExactNmpc(Mpc):
         reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
         estimator_gain: Share of each new residual in the estimate, in (0, 1].
         iteration_limit: Largest number of active-set steps of a solve; 0 for one that grows with it.
+        Q: Weight of the state, a number, the diagonal (12,) or a matrix; the reward's by default.
+        R: Weight of the rotor forces, a number, the diagonal (4,) or a matrix; the reward's by default.
+        terminal: Factor of P, the weight of x_N, or a matrix (12, 12) in its place.
 
     Raises:
         ValueError: If an option is not allowed.
@@ -256,18 +261,22 @@ class ExactNmpc(Mpc):
         *,
         solver: SolverName = "structured",
         frame: Frame = "heading",
-        soft_weight: float = 1e3,
+        soft_weight: float = SOFT_WEIGHT,
         margin: float = 0.02,
         reject_disturbance: bool = False,
         estimator_gain: float = ESTIMATOR_GAIN,
         iteration_limit: int = ITERATION_LIMIT,
+        Q: ArrayLike | None = None,
+        R: ArrayLike | None = None,
+        terminal: ArrayLike = 1.0,
     ) -> None:
         if passes != int(passes) or passes < 1:
             raise ValueError(f"passes must be a whole number >= 1, got {passes!r}")
         require_choice("velocity_error", velocity_error, VelocityError)
         options = MpcOptions(
-            solver, frame, "heading", soft_weight, margin, reject_disturbance, estimator_gain, iteration_limit
-        )
+            solver, frame, "heading", soft_weight, margin, reject_disturbance, estimator_gain,
+            iteration_limit, Q, R, terminal,
+        )  # fmt: skip
         super().__init__(task, horizon, options, pairs=horizon, guess=True)
         self.passes = int(passes)
         self.velocity_error = velocity_error

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from quad_envs._numba import kernel
 from quad_envs.parameters import N_STATE, Array
 from quad_envs.tasks import Task
@@ -13,7 +16,7 @@ from .disturbance import ESTIMATOR_GAIN
 from .fallback import RELAXED
 from .linalg import copy
 from .model import sdc_matrix, zero_order_hold
-from .mpc import Frame, Mpc, MpcOptions, Problem, SolverName, VelocityReference, require_choice
+from .mpc import SOFT_WEIGHT, Frame, Mpc, MpcOptions, Problem, SolverName, VelocityReference, require_choice
 from .mpc_kernels import MpcData, Scratch, begin_row, carve, copy_vector, end_row, hold_trim, solve_row
 from .ocp import IntArray
 from .riccati import solve_dare
@@ -130,6 +133,9 @@ class SdcNmpc(Mpc):
         reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
         estimator_gain: Share of each new residual in the estimate, in (0, 1].
         iteration_limit: Largest number of active-set steps of a solve; 0 for one that grows with it.
+        Q: Weight of the state, a number, the diagonal (12,) or a matrix; the reward's by default.
+        R: Weight of the rotor forces, a number, the diagonal (4,) or a matrix; the reward's by default.
+        terminal: Factor of P, the weight of x_N, or a matrix (12, 12) in its place.
 
     Raises:
         ValueError: If an option is not allowed.
@@ -146,11 +152,14 @@ class SdcNmpc(Mpc):
         solver: SolverName = "structured",
         frame: Frame = "heading",
         velocity_reference: VelocityReference = "heading",
-        soft_weight: float = 1e3,
+        soft_weight: float = SOFT_WEIGHT,
         margin: float = 0.02,
         reject_disturbance: bool = False,
         estimator_gain: float = ESTIMATOR_GAIN,
         iteration_limit: int = ITERATION_LIMIT,
+        Q: ArrayLike | None = None,
+        R: ArrayLike | None = None,
+        terminal: ArrayLike = 1.0,
     ) -> None:
         if not 0.0 <= alpha <= 1.0:
             raise ValueError(
@@ -168,7 +177,15 @@ class SdcNmpc(Mpc):
             reject_disturbance,
             estimator_gain,
             iteration_limit,
+            Q,
+            R,
+            terminal,
         )
+        if terminal_weight == "sdre" and (np.ndim(terminal) > 0 or terminal != 1.0):
+            raise ValueError(
+                "terminal changes P of the hover model; terminal_weight='sdre' has another P at each sample: "
+                "leave terminal out, or choose terminal_weight='hover'"
+            )
         super().__init__(task, horizon, options, pairs=horizon if relinearisations else 1, guess=False)
         self.alpha = float(alpha)
         self.relinearisations = int(relinearisations)

@@ -158,7 +158,7 @@ def ipopt_plan(x_0, rows, last, task, horizon, velocity_error, terminal):
     quiet = {"ipopt.print_level": 0, "print_time": False, "ipopt.tol": 1e-11}
     solver = ca.nlpsol("solver", "ipopt", problem, quiet)
     step = limits.rate * DT
-    box = {"lbx": -HOVER, "ubx": task.force_max - HOVER, "lbg": -step, "ubg": step}
+    box = {"lbx": -HOVER, "ubx": np.tile(task.force_max - HOVER, horizon), "lbg": -step, "ubg": step}
     return np.array(solver(x0=0.0, **box)["x"]).reshape(horizon, 4)
 
 

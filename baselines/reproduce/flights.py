@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -79,7 +80,9 @@ def dissertation_cost(episode: Episode) -> float:
 def fly(flight: Flight) -> Outcome:
     """Fly one episode."""
     settings = {"start": flight.start, "start_box": 0.0, "preview": flight.horizon, **flight.env}
-    env = gymnasium.make("quad/HelixTracking-v0", reference=flight.reference, **settings)
+    with warnings.catch_warnings():  # the text's pulse of 1 N m for 0.1 s exceeds what the vehicle can hold
+        warnings.filterwarnings("ignore", "the disturbance's torque", UserWarning)
+        env = gymnasium.make("quad/HelixTracking-v0", reference=flight.reference, **settings)
     name, options = CONTROLLERS[flight.controller]
     options = {**options, **flight.policy}
     if name != "feedback-linearization":
