@@ -78,7 +78,7 @@ def _check_action(action: Any, shape: tuple[int, ...], space: Any) -> None:
 
 def _answer(policy: Policy, observations: NDArray[Any], state: Any, start: bool) -> tuple[Any, Any]:
     """What predict returns, after a test that it is a pair."""
-    answer = policy.predict(observations, state, _starts(len(observations), start))
+    answer = policy.predict(observations, state, _starts(len(observations), start), deterministic=True)
     _require(
         isinstance(answer, tuple) and len(answer) == 2,
         f"predict must return (actions, state), got {type(answer).__name__}",
@@ -142,16 +142,18 @@ def _fly(policy: Policy, flights: Flights) -> NDArray[np.float32]:
     """Actions on recorded observations, with the state threaded through, (steps, rows, ...)."""
     state, actions = None, []
     for k, observations in enumerate(flights):
-        action, state = policy.predict(observations, state, _starts(len(observations), k == 0))
+        action, state = policy.predict(
+            observations, state, _starts(len(observations), k == 0), deterministic=True
+        )
         actions.append(action)
     return np.stack(actions)
 
 
 def _check_single(policy: Policy, space: Any, flights: Flights) -> None:
     """One observation without a batch axis."""
-    action, _ = policy.predict(flights[0, 0], None, None)
+    action, _ = policy.predict(flights[0, 0], None, None, deterministic=True)
     _check_action(action, space.shape, space)
-    batched, _ = policy.predict(flights[0, :1], None, None)
+    batched, _ = policy.predict(flights[0, :1], None, None, deterministic=True)
     _require(
         bool(np.allclose(action, batched[0], rtol=0.0, atol=_BATCH_TOLERANCE)),
         "an observation (d,) must get the action that it gets as a batch (1, d)",
@@ -168,9 +170,9 @@ def _check_determinism(policy: Policy, flights: Flights) -> None:
 
 def _check_no_mutation(policy: Policy, flights: Flights) -> None:
     rows = flights.shape[1]
-    _, state = policy.predict(flights[0].copy(), None, _starts(rows, True))
+    _, state = policy.predict(flights[0].copy(), None, _starts(rows, True), deterministic=True)
     observations, start, kept = flights[-1].copy(), _starts(rows, False), copy.deepcopy(state)
-    policy.predict(observations, state, start)
+    policy.predict(observations, state, start, deterministic=True)
     _require(bool(np.array_equal(observations, flights[-1])), "predict must not change the observation")
     _require(not start.any(), "predict must not change episode_start")
     _require(_same(state, kept), "predict must not change the state it is given; return a new one")
@@ -192,16 +194,18 @@ def _check_episode_start(policy: Policy, flights: Flights) -> None:
     rows = flights.shape[1]
     state: Any = None
     for k, observations in enumerate(flights):
-        _, state = policy.predict(observations, state, _starts(rows, k == 0))
-    fresh, _ = policy.predict(flights[0], None, _starts(rows, True))
-    again, _ = policy.predict(flights[0], state, _starts(rows, True))
+        _, state = policy.predict(observations, state, _starts(rows, k == 0), deterministic=True)
+    fresh, _ = policy.predict(flights[0], None, _starts(rows, True), deterministic=True)
+    again, _ = policy.predict(flights[0], state, _starts(rows, True), deterministic=True)
     _require(
         bool(np.array_equal(fresh, again)),
         "episode_start = True must make a row forget: its action depends on before",
     )
-    kept, _ = policy.predict(flights[-1], state, _starts(rows, False))
+    kept, _ = policy.predict(flights[-1], state, _starts(rows, False), deterministic=True)
     only_first = np.arange(rows) == 0
-    mixed, _ = policy.predict(np.where(only_first[:, None], flights[0], flights[-1]), state, only_first)
+    mixed, _ = policy.predict(
+        np.where(only_first[:, None], flights[0], flights[-1]), state, only_first, deterministic=True
+    )
     _require(
         bool(np.array_equal(mixed[0], fresh[0]) and np.array_equal(mixed[1:], kept[1:])),
         "episode_start must reset the rows it flags and leave the others as they are",
@@ -225,7 +229,9 @@ def _check_interleaving(policy: Policy, flights: Flights) -> None:
     states: list[Any] = [None, None]
     for k in range(len(flights)):
         for row in range(2):
-            action, states[row] = policy.predict(flights[k, row : row + 1], states[row], _starts(1, k == 0))
+            action, states[row] = policy.predict(
+                flights[k, row : row + 1], states[row], _starts(1, k == 0), deterministic=True
+            )
             _require(
                 bool(np.array_equal(action, expected[row][k])),
                 f"episodes flown in turn must not influence each other: the action of step {k} changed; "
@@ -242,5 +248,5 @@ def _check_pickling(policy: Policy, flights: Flights) -> None:
         bool(np.array_equal(_fly(policy, flights), _fly(twin, flights))),
         "a pickled policy must give the same actions",
     )
-    _, state = policy.predict(flights[0], None, _starts(flights.shape[1], True))
+    _, state = policy.predict(flights[0], None, _starts(flights.shape[1], True), deterministic=True)
     _require(_same(pickle.loads(pickle.dumps(state)), state), "the state must pickle")

@@ -82,6 +82,40 @@ def require_own_task(env: Any) -> None:
     raise _no_task(env)
 
 
+_REWRITERS = (
+    gymnasium.ObservationWrapper,
+    gymnasium.ActionWrapper,
+    gymnasium.vector.VectorObservationWrapper,
+    gymnasium.vector.VectorActionWrapper,
+)
+_HARMLESS = (
+    gymnasium.wrappers.FlattenObservation,
+    gymnasium.wrappers.ClipAction,
+)  # same numbers for a flat Box
+
+
+def require_own_numbers(policy: Any, env: Any) -> None:
+    """Check that a policy of a task gets that task's observations and that its actions arrive as they are.
+
+    A policy that has a `task` reads its layout; a wrapper that normalises, delays or rescales would feed it
+    other numbers in the same shape. What a policy without a `task` wants, only its owner knows.
+
+    Raises:
+        ValueError: If a wrapper stands between them; it names the wrapper and the remedy.
+    """
+    if not isinstance(getattr(policy, "task", None), BaseTask):
+        return
+    inner = env
+    while isinstance(inner, gymnasium.Wrapper | gymnasium.vector.VectorWrapper):
+        if isinstance(inner, _REWRITERS) and not isinstance(inner, _HARMLESS):
+            name = getattr(policy, "name", type(policy).__name__)
+            raise ValueError(
+                f"the wrapper {type(inner).__name__} changes observations or actions, and policy {name!r} "
+                "reads and writes those of its task: evaluate it in env.unwrapped, or without the wrapper"
+            )
+        inner = inner.env
+
+
 def _no_task(source: Any) -> ValueError:
     return ValueError(
         f"cannot find the task of {source!r}: give an environment of this suite (gymnasium.make, "

@@ -23,7 +23,7 @@ from .metrics import (
     totals,
     worst_violations,
 )
-from .policy import Policy
+from .policy import Policy, make_policy
 from .results import plain_json
 from .rollout import Episode, is_privileged, run_episodes
 from .table import format_number, format_table
@@ -174,7 +174,7 @@ def _times(quantiles: tuple[float, float, float]) -> str:
 
 
 def evaluate(
-    policy: Policy,
+    policy: Policy | str,
     env: Any,
     episodes: int = 20,
     seed: int = 0,
@@ -186,16 +186,17 @@ def evaluate(
     record per vehicle and flight; means and intervals are over flights.
 
     Args:
-        policy: From `make_policy`, or anything with `predict`.
+        policy: From `make_policy`, the name of one that it knows, or anything with `predict`.
         env: An id, a Gymnasium environment or a ParallelEnv (decisions are timed), or a vector environment.
         episodes: Number of flights, >= 1.
         seed: Flight i starts with the environment seed `seed + i`.
         on_episode: Called with each flight, of a team with that of each vehicle, to save or plot it.
 
     Raises:
-        ValueError: If the id is unknown or episodes < 1.
+        ValueError: If the id or the policy's name is unknown, episodes < 1, or as `run_episodes` says.
     """
     env, size = make_env(env) if isinstance(env, str) else env, 1
+    policy = make_policy(policy, env) if isinstance(policy, str) else policy
     records, times, team_times = [], [], []
     for episode in run_episodes(policy, env, episodes, seed):
         records.append(measure(episode))

@@ -20,7 +20,7 @@ from quad_envs.parameters import Array
 from quad_envs.tasks import BaseTask, TeamTask
 
 from .checks import require_whole
-from .environments import is_parallel, require_own_task
+from .environments import is_parallel, require_own_numbers, require_own_task
 from .episode import INFO, Episode, Recorder, Said
 from .policy import Policy
 from .team_signals import TEAM_INFO, WRAPPER_INFO
@@ -48,12 +48,14 @@ def run_episodes(policy: Policy, env: Any, episodes: int, seed: int = 0) -> Iter
         seed: Seed of the first one, >= 0.
 
     Raises:
-        ValueError: If episodes < 1, the seed < 0, the environment is not of this suite, a vector environment
-            resets in the same step, or a privileged policy cannot see the truth.
+        ValueError: If episodes < 1, the seed < 0, the environment is not of this suite, a wrapper changes the
+            numbers that a policy of the task reads or writes, a vector environment resets in the same step,
+            or a privileged policy cannot see the truth.
     """
     require_whole("episodes", episodes, 1)
     require_whole("seed", seed, 0)
     require_own_task(env)
+    require_own_numbers(policy, env)
     if is_privileged(policy) and not is_parallel(env):
         raise ValueError(
             f"{type(policy).__name__} decides from the truth about one team: fly it in a ParallelEnv, "
