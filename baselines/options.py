@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import ast
-import json
 from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar, get_args, get_type_hints
+
+from .flow import read_value
 
 Options = TypeVar("Options")
 
@@ -43,10 +43,12 @@ class EvaluateOptions:
     policy: Annotated[str, Positional("policy, as sdc-nmpc, or the folder of a trained one")]
     episodes: Annotated[int, "number of flights"] = 20
     seed: Annotated[int, "environment seed of the first flight"] = 0
-    set: Annotated[list[str], "keyword argument of the environment; JSON, else text"] = field(
+    set: Annotated[list[str], "keyword argument of the environment; JSON, {key: value}, or text"] = field(
         default_factory=list
     )
-    policy_set: Annotated[list[str], "option of the policy; JSON, else text"] = field(default_factory=list)
+    policy_set: Annotated[list[str], "option of the policy; JSON, {key: value}, or text"] = field(
+        default_factory=list
+    )
     json: Annotated[bool, "print JSON"] = False
     out: Annotated[Path | None, "results folder"] = None
     fresh: Annotated[bool, "discard what the results folder holds of an earlier run"] = False
@@ -80,10 +82,10 @@ class TrainOptions:
     seconds: Annotated[float | None, "budget in CPU-seconds; the algorithm's own if not given"] = None
     steps: Annotated[int | None, "budget in environment steps instead"] = None
     out: Annotated[Path | None, "folder; runs/ALGORITHM-TASK-SEED if not given"] = None
-    set: Annotated[list[str], "keyword argument of the environment; JSON, else text"] = field(
+    set: Annotated[list[str], "keyword argument of the environment; JSON, {key: value}, or text"] = field(
         default_factory=list
     )
-    hyper: Annotated[list[str], "hyperparameter of the algorithm; JSON, else text"] = field(
+    hyper: Annotated[list[str], "hyperparameter of the algorithm; JSON, {key: value}, or text"] = field(
         default_factory=list
     )
     from_: Annotated[str, "begin with the network of a checkpoint: its folder, or a shipped policy"] = ""
@@ -131,10 +133,12 @@ class CertifyOptions:
     policy: Annotated[str, Positional("lmpc, sdc-nmpc, sdre, lqr or nmpc")]
     seed: Annotated[int, "of the flight and of the random starts"] = 0
     starts: Annotated[int, "random starts in each invariant ellipsoid"] = 100
-    set: Annotated[list[str], "keyword argument of the environment; JSON, else text"] = field(
+    set: Annotated[list[str], "keyword argument of the environment; JSON, {key: value}, or text"] = field(
         default_factory=list
     )
-    policy_set: Annotated[list[str], "option of the policy; JSON, else text"] = field(default_factory=list)
+    policy_set: Annotated[list[str], "option of the policy; JSON, {key: value}, or text"] = field(
+        default_factory=list
+    )
     json: Annotated[bool, "print JSON"] = False
     out: Annotated[Path | None, "folder for certify.json and the figures"] = None
 
@@ -208,24 +212,22 @@ def read_assignments(flag: str, texts: Sequence[str]) -> dict[str, Any]:
     """KEY=VALUE texts as a mapping.
 
     Raises:
-        ValueError: If one has no '=', or a key comes twice.
+        ValueError: If one has no '=', a key comes twice, or a value begins with a bracket and is no mapping.
     """
     out: dict[str, Any] = {}
     for text in texts:
         key, equals, value = text.partition("=")
         if not equals or not key:
-            raise ValueError(f"{flag} needs KEY=VALUE, as {flag} kappa=0.3125; got {text!r}")
+            raise ValueError(f"{flag} needs KEY=VALUE, as {flag} kappa=0.3125; got {_short(text)}")
         if key in out:
-            raise ValueError(f"{flag} sets {key!r} twice")
-        out[key] = _value(value)
+            raise ValueError(f"{flag} sets {_short(key)} twice")
+        try:
+            out[key] = read_value(value)
+        except ValueError as error:
+            raise ValueError(f"{flag} {_short(key)}: {error}") from None
     return out
 
 
-def _value(text: str) -> Any:
-    """JSON, else a Python literal as .5 or (1, 2), else the text itself."""
-    for read in (json.loads, ast.literal_eval):
-        try:
-            return read(text)
-        except (ValueError, SyntaxError):
-            continue
-    return text
+def _short(text: str) -> str:
+    """A text in a message."""
+    return repr(text if len(text) <= 60 else f"{text[:57]}...")

@@ -7,14 +7,16 @@ control step k, so that a step may begin or end a pulse without smearing it over
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .authority import hover_authority
-from .names import unknown_name
+from .kinds import as_tuple, is_number, make_kind, refuse_class
+from .names import shown, unknown_name
 from .parameters import Array, Limits, QuadrotorParams
 
 _Vector = tuple[float, float, float]
@@ -190,34 +192,78 @@ class Impulse:
         return out
 
 
-_BY_NAME: dict[str, Callable[[], Disturbance]] = {
-    "torque-pulse": TorquePulse,
-    "steady": Steady,
-    "gusts": Gusts,
-    "impulse": Impulse,
+@dataclass(frozen=True, slots=True)
+class FunctionDisturbance:
+    """A function t -> force (3), N, inertial, or force and torque (6), N m, body axes."""
+
+    function: Callable[[float], ArrayLike]
+    random: ClassVar[bool] = False
+
+    def values(self, t: Array, rng: np.random.Generator) -> Array:
+        """Torque and force at the nodes, (n_steps, n_nodes, 6); a jump does not reach the step before it."""
+        times = t.copy()
+        times[:, -1] -= 1e-6 * (t[:, -1] - t[:, 0])
+        given = [self.function(float(time)) for time in times.ravel()]
+        try:
+            out = np.array(given, dtype=np.float64)
+        except (TypeError, ValueError):
+            out = np.empty((0, 0))
+        if out.ndim != 2 or out.shape[1] not in (3, 6):
+            raise ValueError(
+                "a disturbance as a function must return 3 (force) or 6 (force, torque) numbers at every "
+                f"time, got {shown(given[0])} at first"
+            )
+        torque = out[:, 3:] if out.shape[1] == 6 else np.zeros_like(out)
+        return np.concatenate([torque, out[:, :3]], axis=1).reshape(*t.shape, 6)
+
+
+DISTURBANCES: dict[str, Disturbance] = {
+    "torque-pulse": TorquePulse(),
+    "steady": Steady(),
+    "gusts": Gusts(),
+    "impulse": Impulse(),
 }
+DisturbanceLike: TypeAlias = (
+    "str | Disturbance | Mapping[str, Any] | tuple[float, ...] | Callable[[float], ArrayLike] | None"
+)
 
 
-def make_disturbance(what: str | Disturbance | None) -> Disturbance | None:
-    """A disturbance from a name, itself, or None (also "none").
+def make_disturbance(what: DisturbanceLike) -> Disturbance | None:
+    """A disturbance from what a user has at hand.
+
+    Args:
+        what: A name, a mapping {"kind": "steady", "force": [0, 1, 0]}, three numbers (a constant force, N,
+            inertial) or six (and a torque, N m, body axes), a function of time that returns as many, a
+            Disturbance, or None (also "none").
 
     Raises:
         ValueError: If it is none of these.
     """
-    if what is None or what == "none":
+    if what is None or (isinstance(what, str) and what == "none"):
         return None
-    if isinstance(what, str) and what in _BY_NAME:
-        return _BY_NAME[what]()
+    refuse_class("disturbance", what)
     if isinstance(what, Disturbance):
         return what
     if isinstance(what, str):
-        raise ValueError(unknown_name("disturbance", what, ["none", *_BY_NAME]))
-    raise ValueError(f"disturbance must be None, a name or a Disturbance, got {what!r}")
+        if what in DISTURBANCES:
+            return DISTURBANCES[what]
+        raise ValueError(unknown_name("disturbance", what, ["none", *DISTURBANCES]))
+    if isinstance(what, Mapping):
+        made: Disturbance = make_kind("disturbance", what, DISTURBANCES)
+        return made
+    if callable(what):
+        return FunctionDisturbance(what)
+    numbers = as_tuple(what)
+    if not isinstance(numbers, tuple) or len(numbers) not in (3, 6) or not all(map(is_number, numbers)):
+        raise ValueError(
+            "disturbance must be None, a name, a mapping with 'kind', a force of 3 finite numbers, N (or 6, "
+            f"with a torque, N m), a function of time or a Disturbance, got {shown(what)}"
+        )
+    force, torque = numbers[:3], numbers[3:] or _ZERO
+    return Steady(force=force, torque=torque)
 
 
-def disturbance_of(
-    what: str | Disturbance | None, params: QuadrotorParams, limits: Limits
-) -> Disturbance | None:
+def disturbance_of(what: DisturbanceLike, params: QuadrotorParams, limits: Limits) -> Disturbance | None:
     """`make_disturbance` for a vehicle: with the deviations that follow from it."""
     made = make_disturbance(what)
     if isinstance(made, Gusts):

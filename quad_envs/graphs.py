@@ -12,7 +12,7 @@ graphs of chapter 7. Names of schedules: `chapter-6` (4 vehicles), `switching` (
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
@@ -20,11 +20,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .formations import FORMATIONS, lattice_cells
-from .names import unknown_name
+from .kinds import is_number, make_kind, refuse_class
+from .names import shown, unknown_name
 from .parameters import Array
 
-Edges: TypeAlias = Iterable[tuple[int, int]]  # (sender, receiver), rows counted from 0
-GraphLike: TypeAlias = "str | ArrayLike"
+# (sender, receiver), rows counted from 0, or (sender, receiver, weight)
+Edges: TypeAlias = "Iterable[tuple[int, int] | tuple[int, int, float]]"
+GraphLike: TypeAlias = "str | ArrayLike | Edges"
 
 _HEXAGON_WEAK = ((0, 1), (0, 5), (1, 2), (5, 4), (2, 3))
 # Chapter 7: a two-way ring 1-2-4-6-5-3-1 where all measure; a graph where only 1 and 2 measure.
@@ -39,27 +41,56 @@ SCHEDULES = ("chapter-6", "switching")
 
 
 def adjacency(n: int, edges: Edges) -> Array:
-    """G (n, n) of a list of (sender, receiver) pairs: the receiver hears the sender.
+    """G (n, n) of (sender, receiver) pairs, or (sender, receiver, weight): the receiver hears the sender.
 
     Raises:
-        ValueError: If a pair names a vehicle outside 0 .. n-1 or joins one to itself.
+        ValueError: If an edge names a vehicle outside 0 .. n-1 or joins one to itself, or weighs nothing.
     """
     G = np.eye(n)
-    for sender, receiver in edges:
-        if not (0 <= sender < n and 0 <= receiver < n) or sender == receiver:
+    for sender, receiver, *weight in edges:
+        if sender not in range(n) or receiver not in range(n) or sender == receiver:
             raise ValueError(
                 f"an edge is (sender, receiver), two different vehicles of 0 .. {n - 1}, "
-                f"got ({sender}, {receiver})"
+                f"got ({shown(sender)}, {shown(receiver)})"
             )
-        G[receiver, sender] = 1.0
+        w = weight[0] if weight else 1.0
+        if not (is_number(w) and w > 0.0):
+            raise ValueError(
+                f"the weight of an edge must be a finite number > 0, got {shown(w)} of ({sender}, {receiver})"
+            )
+        G[int(receiver), int(sender)] = w
     return G
 
 
+def edges_of(graph: Any) -> tuple[tuple[Any, ...], ...]:
+    """Edges (sender, receiver, weight) of a graph of networkx: u -> v is heard by v, undirected both ways.
+
+    Raises:
+        ValueError: If its nodes are not numbered from 0.
+    """
+    edges = [(u, v, 1.0 if w is None else w) for u, v, w in graph.edges(data="weight")]
+    if not graph.is_directed():
+        edges += [(v, u, w) for u, v, w in edges]
+    if set(graph.nodes) - set(range(len(graph.nodes))):
+        raise ValueError(
+            f"nodes of a graph must be 0 .. {len(graph.nodes) - 1}, the vehicles, got "
+            f"{shown(list(graph.nodes))}: networkx.convert_node_labels_to_integers numbers them"
+        )
+    return tuple(edges)
+
+
+def is_networkx(what: Any) -> bool:
+    """Whether it is a graph of networkx, or one that looks like it."""
+    return all(hasattr(what, name) for name in ("nodes", "edges", "is_directed"))
+
+
 def make_graph(what: GraphLike, formation: str | None, n: int) -> Array:
-    """A graph from its name or its matrix.
+    """A graph from its name, its matrix, its edges, or one of networkx.
 
     Args:
-        what: One of `GRAPHS`, or weights G (n, n), row i what i hears, >= 0; the diagonal is not read.
+        what: One of `GRAPHS`; or weights G (n, n), row i what i hears, >= 0, the diagonal is not read; or
+            edges (sender, receiver) or (sender, receiver, weight), if these are not n rows of n; or a
+            graph of networkx.
         formation: Name of the formation, which `weak` and `strong` need; None for slots of your own.
         n: Number of vehicles.
 
@@ -71,12 +102,21 @@ def make_graph(what: GraphLike, formation: str | None, n: int) -> Array:
     """
     if isinstance(what, str):
         return adjacency(n, _named_edges(what, formation, n))
+    if is_networkx(what):
+        return adjacency(n, edges_of(what))
+    if _are_edges(what, n):
+        return adjacency(n, what)  # type: ignore[arg-type]
     try:
         G = np.array(what, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"a graph is a name or an ({n}, {n}) matrix of weights, got {what!r}") from None
+        raise ValueError(
+            f"a graph is a name, an ({n}, {n}) matrix of weights or edges (sender, receiver), "
+            f"got {shown(what)}"
+        ) from None
     if G.shape != (n, n):
-        raise ValueError(f"the graph of {n} vehicles is a name or an ({n}, {n}) matrix, got shape {G.shape}")
+        raise ValueError(
+            f"the graph of {n} vehicles is a name, edges or an ({n}, {n}) matrix, got shape {G.shape}"
+        )
     np.fill_diagonal(G, 1.0)
     if not (np.isfinite(G) & (G >= 0.0)).all():
         i, j = np.argwhere(~(np.isfinite(G) & (G >= 0.0)))[0]
@@ -84,6 +124,16 @@ def make_graph(what: GraphLike, formation: str | None, n: int) -> Array:
             f"weights of a graph must be finite and >= 0 (0: does not hear), got {G[i, j]} at [{i}, {j}]"
         )
     return G
+
+
+def _are_edges(what: Any, n: int) -> bool:
+    """Whether it is a list of edges; n rows of n are a matrix."""
+    if isinstance(what, np.ndarray):
+        return what.ndim == 2 and what.shape[1] in (2, 3) and what.shape not in ((n, n), (3, 3))
+    if not isinstance(what, list | tuple | set | frozenset):
+        return False
+    lengths = {len(edge) if isinstance(edge, list | tuple) else 0 for edge in what}
+    return lengths <= {2, 3} and not (len(what) == n and lengths == {n})
 
 
 def _named_edges(name: str, formation: str | None, n: int) -> Edges:
@@ -169,9 +219,15 @@ def _frozen(graphs: Sequence[GraphLike]) -> tuple[Any, ...]:
         raise ValueError(f"a schedule needs a sequence of graphs, got the single name {graphs!r}")
 
     def nested(entry: Any) -> Any:
+        entry = entry.tolist() if isinstance(entry, np.ndarray) else entry
         return tuple(map(nested, entry)) if isinstance(entry, list | tuple) else entry
 
-    frozen = tuple(g if isinstance(g, str) else nested(np.asarray(g).tolist()) for g in graphs)
+    def plain(entry: Any) -> Any:
+        if isinstance(entry, str) or is_networkx(entry):
+            return entry if isinstance(entry, str) else edges_of(entry)
+        return nested(entry if isinstance(entry, list | tuple) else np.asarray(entry).tolist())
+
+    frozen = tuple(map(plain, graphs))
     if not frozen:
         raise ValueError("a schedule needs at least one graph, got none")
     return frozen
@@ -253,7 +309,8 @@ class GraphTable(NamedTuple):
     which: NDArray[np.int64]  # (steps + 1,), row of `graphs` at each step
 
 
-GraphSchedule: TypeAlias = "Switching | Timed | Callable[[int], GraphLike]"
+GraphSchedule: TypeAlias = "Switching | Timed | Mapping[str, Any] | Callable[[int], GraphLike]"
+KINDS: dict[str, Any] = {"switching": Switching(), "timed": Timed}
 
 
 def make_graph_table(
@@ -262,8 +319,9 @@ def make_graph_table(
     """The graphs of an episode from a graph, a schedule, or a function of the step.
 
     Args:
-        what: What `make_graph` takes, one of `SCHEDULES`, a `Switching`, a `Timed`, or a function of the step
-            number k = 0 .. steps that returns what `make_graph` takes.
+        what: What `make_graph` takes, one of `SCHEDULES`, a `Switching`, a `Timed`, a mapping {"kind":
+            "switching", "dwell_steps": 10, ...} of one of these, or a function of the step number
+            k = 0 .. steps that returns what `make_graph` takes.
         formation: Name of the formation, or None.
         n: Number of vehicles.
         steps: Control periods of an episode.
@@ -275,6 +333,9 @@ def make_graph_table(
     Raises:
         ValueError: If a graph or the schedule does not fit the team.
     """
+    refuse_class("graph", what)
+    if isinstance(what, Mapping):
+        what = make_kind("graph", what, KINDS)
     if isinstance(what, str) and what in SCHEDULES:
         team = 4 if what == "chapter-6" else 6
         if n != team:
@@ -288,7 +349,8 @@ def make_graph_table(
     elif callable(what):
         graphs, which = _sampled(what, formation, n, steps)
     else:
-        graphs, which = make_graph(what, formation, n)[None], np.zeros(steps + 1, dtype=np.int64)
+        G = make_graph(what, formation, n)  # type: ignore[arg-type]
+        graphs, which = G[None], np.zeros(steps + 1, dtype=np.int64)
     used, which = np.unique(which, return_inverse=True)
     return GraphTable(np.ascontiguousarray(graphs[used]), which.astype(np.int64))
 

@@ -1,23 +1,34 @@
 """Targets to follow or to estimate, as data: rows [r 3, v 3] at given times; NED, inertial, SI.
 
 The defaults are the motions of chapters 6 and 7. A target of your own is `target_from_function(f)`,
-`PathTarget(reference)` of any reference, the path of a .csv file, or any object with `random` and
+`PathTarget(reference)` of any reference, the path of a table, or any object with `random` and
 `rows(t, rng)`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, TypeAlias, runtime_checkable
+from typing import Any, ClassVar, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .names import unknown_name
+from .kinds import make_kind, refuse_class
+from .names import shown, unknown_name
 from .parameters import Array
-from .references import Reference, from_csv, from_function
+from .references import (
+    REFERENCES,
+    CsvTable,
+    Reference,
+    ReferenceLike,
+    SetPoint,
+    from_function,
+    is_table,
+    make_reference,
+    plain_reference,
+)
 
 N_TARGET = 6  # r, v
 _VECTORS = ("position", "velocity")
@@ -260,29 +271,48 @@ def target_from_function(function: Callable[[float], ArrayLike]) -> Target:
     return PathTarget(from_function(function))
 
 
-_BY_NAME: dict[str, Callable[[], Target]] = {
-    "static": StaticTarget,
-    "cv": ConstantVelocity,
-    "turn": TurningTarget,
-    "aircraft": Aircraft,
-    "chapter-6": lambda: ConstantVelocity((3.0, 3.0, -6.0), (0.8, 0.3, -0.1), 0.02),
+TARGETS: dict[str, Any] = {
+    "static": StaticTarget(),
+    "cv": ConstantVelocity(),
+    "turn": TurningTarget(),
+    "aircraft": Aircraft(),
+    "chapter-6": ConstantVelocity((3.0, 3.0, -6.0), (0.8, 0.3, -0.1), 0.02),
+    "path": PathTarget,
 }
+_KINDS = {**TARGETS, **REFERENCES}  # a target may move along any reference
+TargetLike: TypeAlias = "Target | ReferenceLike"
 
 
-def make_target(what: str | Target | Reference) -> Target:
-    """A target from a name, the path of a .csv file (columns as in `from_csv`), a trajectory, or itself.
+def make_target(what: Any) -> Target:
+    """A target from what a user has at hand.
+
+    Args:
+        what: A name, the path of a table, a mapping {"kind": "turn", "rate": 0.1}, a function t -> r (3) or
+            [r, v] (6), an array as `ArrayTable` has it, three numbers (at rest), any reference, or a Target.
 
     Raises:
         ValueError: If it is none of these.
     """
+    refuse_class("target", what)
     if isinstance(what, StaticTarget | ConstantVelocity | TurningTarget | Aircraft | PathTarget):
         return what
     if isinstance(what, Target):
         return PathTarget(what)
-    if isinstance(what, str):
-        if what in _BY_NAME:
-            return _BY_NAME[what]()
-        if what.endswith(".csv"):
-            return PathTarget(from_csv(what))
-        raise ValueError(f"{unknown_name('target', what, _BY_NAME)}, or a path ending in .csv")
-    raise ValueError(f"target must be a name, a path ending in .csv or a Target, got {what!r}")
+    if isinstance(what, str) and what in _KINDS:
+        return make_target({"kind": what})
+    if isinstance(what, Mapping) and "kind" in what:
+        return make_target(make_kind("target", what, _KINDS, {"reference": make_reference, "path": _path_of}))
+    if isinstance(what, str) and not is_table(what):
+        raise ValueError(f"{unknown_name('target', what, _KINDS)}, or the path of a table")
+    made = CsvTable(what) if is_table(what) else plain_reference(what)
+    if made is None:
+        raise ValueError(
+            "target must be a name, the path of a table, a mapping with 'kind', a function of time, an array "
+            f"or a Target, got {shown(what)}"
+        )
+    return StaticTarget(made.position) if isinstance(made, SetPoint) else PathTarget(made)
+
+
+def _path_of(what: Any) -> Any:
+    """What the field `path` holds: of a table its file, of a `PathTarget` another trajectory."""
+    return what if is_table(what) else make_target(what)

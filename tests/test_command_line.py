@@ -61,19 +61,73 @@ def test_set_reaches_the_environment_and_policy_set_the_policy(capsys):
     assert first["summary"]["effort"]["mean"] < second["summary"]["effort"]["mean"]
 
 
-def test_assignments_are_json_or_python_or_text():
-    texts = ["a=1", "b=.5", "c=[1, 2]", "d=true", "e=wind", "f=x=y", "g=None", 'h={"mass": 0.1}']
-    expected = {
-        "a": 1,
-        "b": 0.5,
-        "c": [1, 2],
-        "d": True,
-        "e": "wind",
-        "f": "x=y",
-        "g": None,
-        "h": {"mass": 0.1},
-    }
-    assert read_assignments("--set", texts) == expected
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("1", 1),
+        (".5", 0.5),
+        ("[1, 2]", [1, 2]),
+        ("(1, 2)", (1, 2)),
+        ("true", True),
+        ("None", None),
+        ("wind", "wind"),
+        ("x=y", "x=y"),
+        ("", ""),
+        ('{"mass": 0.1}', {"mass": 0.1}),
+        ("{kind: helix, radius: 2}", {"kind": "helix", "radius": 2}),
+        ("{kind = line, velocity = [1, 0, -.2]}", {"kind": "line", "velocity": [1, 0, -0.2]}),
+        ("{ kind : csv , path: ~/my logs/a.csv , }", {"kind": "csv", "path": "~/my logs/a.csv"}),
+        ("{path: C:\\logs\\a.csv}", {"path": "C:\\logs\\a.csv"}),
+        ("{a: {b: [1, {c: true}], 'd, e': \"f: g\"}}", {"a": {"b": [1, {"c": True}], "d, e": "f: g"}}),
+        ("[helix, {}, []]", ["helix", {}, []]),
+    ],
+)
+def test_assignments_are_json_or_python_or_mappings_or_text(text, expected):
+    assert read_assignments("--set", [f"key={text}"]) == {"key": expected}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{kind: helix", "expected ',' or '}' at character 13, got the end"),
+        ("{kind: helix, radius}", "expected a key and ':' at character 21, got '}'"),
+        ("{kind: helix} 3", "expected nothing more at character 15, got '3'"),
+        ("{kind: , radius: 2}", "expected a value at character 8"),
+        ("{kind: 'helix}", "expected a closing '"),
+        ("{a: 1, a: 2}", "'a' is there twice"),
+        ("[1, 2", "expected ',' or ']'"),
+        ("[" * 3000 + "]" * 3000, "more than 20 brackets in each other"),
+        ("{a: " + "b" * 100_000, "expected ',' or '}' at character 100005"),
+        ("1" * 2_000_000, "longer than 1000000 characters"),
+    ],
+)
+def test_mappings_with_mistakes_are_refused_with_the_place(capsys, text, message):
+    said = fails(capsys, "evaluate", HELIX, "hover", "--set", f"reference={text}")
+    assert message in said and "--set 'reference'" in said and len(said) < 300
+
+
+def test_references_as_mappings_fly_from_the_command_line(capsys, tmp_path):
+    (tmp_path / "up.csv").write_text("t,x,y,z\n0,0,0,0\n0.5,0,0,1\n1,0,0,2\n")
+    table, found = f"{{kind: csv, path: {tmp_path / 'up.csv'}, axes: enu}}", []
+    for reference in ("{kind: line, velocity: [0, 0, -2]}", table):
+        arguments = ["--episodes", "1", "--json", "--set", "time_limit=1", "--set", f"reference={reference}"]
+        assert main(["evaluate", HELIX, "lqr", *arguments]) == 0
+        found.append(json.loads(capsys.readouterr().out)["summary"]["score"]["mean"])
+    # The table ends with the episode, and what comes after is not scored: the same flight.
+    assert found[0] == pytest.approx(found[1], abs=1e-12)
+
+
+def test_mappings_stand_in_suites_too(capsys, tmp_path):
+    suite, out = tmp_path / "suite.toml", tmp_path / "run"
+    suite.write_text(
+        'policies = ["lqr"]\nepisodes = 1\nseed = 0\n[[envs]]\nid = "quad/HelixTracking-v0"\nlabel = "line"\n'
+        '[envs.kwargs]\ntime_limit = 1.0\nreference = {kind = "line", velocity = [0, 0, -2]}\n'
+        '[[conditions]]\nlabel = "wind"\nkwargs = {disturbance = {kind = "steady", force = [0.2, 0, 0]}}\n'
+    )
+    assert main(["benchmark", str(suite), "--out", str(out)]) == 0
+    assert "wind" in capsys.readouterr().out
+    suite.write_text(suite.read_text().replace('"line", v', '"lin", v'))
+    assert "did you mean 'line'" in fails(capsys, "benchmark", str(suite), "--out", str(tmp_path / "other"))
 
 
 def test_evaluate_leaves_a_results_folder(capsys, tmp_path):
@@ -128,6 +182,13 @@ def test_evaluate_discards_another_run_if_asked_to(capsys, tmp_path):
         (["evaluate", "quad/Formation-v0", "lmpc"], "for tracking tasks, not for formation"),
         (["evaluate", HELIX, "consensus-mpc"], "for formation tasks, not for tracking"),
         (["evaluate", HELIX, "hover", "--set", "reference=nofile.csv"], "nofile.csv"),
+        (["evaluate", HELIX, "hover", "--set", "reference={kind: heliks}"], "did you mean 'helix'"),
+        (
+            ["evaluate", HELIX, "hover", "--set", "reference={kind: helix, radios: 2}"],
+            "did you mean 'radius'",
+        ),
+        (["evaluate", HELIX, "hover", "--set", "disturbance={kind: gusts, force: -1}"], "deviation >= 0"),
+        (["evaluate", HELIX, "hover", "--set", "reference=" + "x" * 5000], "unknown reference 'xxx"),
         (["evaluate", HELIX, "hover", "--seed", "-1"], "seed must be a whole number >= 0, got -1"),
         (["evaluate", "CartPole-v1", "hover"], "one of the ids quad/Regulation-v0"),
         (["evaluate", HELIX, "hover", "--save-episodes"], "--save-episodes needs a folder"),

@@ -184,7 +184,7 @@ def test_make_target_returns_a_target_as_it_is():
     ("make", "message"),
     [
         (lambda: make_target("turm"), "did you mean 'turn'"),
-        (lambda: make_target(3), "a name, a path ending in .csv or a Target, got 3"),
+        (lambda: make_target(3), "a name, the path of a table, .* or a Target, got 3"),
         (lambda: StaticTarget((0.0, 1.0)), "position of StaticTarget must be three finite numbers"),
         (lambda: ConstantVelocity(velocity=(0.0, math.nan, 0.0)), "velocity of ConstantVelocity"),
         (lambda: ConstantVelocity(q=-1.0), "q of ConstantVelocity must be >= 0"),

@@ -51,11 +51,11 @@ class FormationEnv(TeamEnv):
         1 m, `start` "random", "line", "sorted", "box" or (N, 3), `separation` d_s 0.4 m, `crash_distance`
         0.33 m (both follow another arm: 2 arm, and 0.07 m more but at least 0.4), `sensing_radius` 2 m,
         `sensed` slots, `terminate` "team" or "agent", `arena` 100 m.
-    Communication: `graph` "weak", "strong", "chain", "ring", "star", "complete", "switching", a matrix (row i
-        is what i hears), a `Switching` or `Timed` schedule or a function of the step; `leader_weight` 10 of
-        a link toward the leader where weights are 1, `drop_out` probability, `delay` steps,
-        `message_lifetime` 2 s for which the last message stays valid, `neighbours` slots, `comm` "state" or
-        "plan".
+    Communication: `graph` "weak", "strong", "chain", "ring", "star", "complete", "switching", a matrix (row
+        i is what i hears), edges (sender, receiver), a graph of networkx, a `Switching` or `Timed` schedule
+        or a function of the step; `leader_weight` 10 of a link toward the leader where weights are 1,
+        `drop_out` probability, `delay` steps, `message_lifetime` 2 s for which the last message stays valid,
+        `neighbours` slots, `comm` "state" or "plan".
     Task: `reference` of the leader ("line", "setpoint", "fast-line", "slow-helix", any of the suite's),
         `preview` 5 stages of it, `formation_weight` w 1, `time_limit` 20 s or `max_cycles` steps.
 

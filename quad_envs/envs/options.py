@@ -8,12 +8,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ..kinds import is_number
 from ..names import shown
 from ..observations import TrackingLayout
 from ..parameters import N_STATE, Array
 from ..references import ReferenceLike
 from ..tasks import Task
-from .vehicle_options import CRASH_TILT, VehicleOptions, is_number
+from .vehicle_options import CRASH_TILT, VehicleOptions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

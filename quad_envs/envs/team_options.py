@@ -21,12 +21,14 @@ from ..graphs import (
     make_graph_table,
     toward_leader,
 )
+from ..kinds import is_number
+from ..names import shown
 from ..parameters import Array, QuadrotorParams
-from ..references import Reference, ReferenceLike
+from ..references import ReferenceLike
 from ..sensors import sensor_rows
-from ..targets import Target, make_target
+from ..targets import TargetLike, make_target
 from ..tasks import TeamTask
-from .vehicle_options import Triple, VehicleOptions, is_number, spread
+from .vehicle_options import Triple, VehicleOptions, spread
 
 MOST_VEHICLES = 200
 FEW_VEHICLES = 6  # up to which everybody has a slot for everybody
@@ -195,7 +197,7 @@ class TeamOptions(VehicleOptions):
         spanned = self._spans(graphs)
         if not spanned:
             warnings.warn(
-                f"the union of the graphs {self.graph!r} has no spanning tree from "
+                f"the union of the graphs {shown(self.graph)} has no spanning tree from "
                 f"{'the leader' if self.has_leader else 'the vehicles that measure'} to everybody: "
                 "who is not reached cannot follow",
                 stacklevel=2,
@@ -269,7 +271,7 @@ class TargetTrackingOptions(TeamOptions):
     env_id: str = "quad/TargetTracking-v0"
     formation: str | _Rows = "chapter-7"
     graph: str | GraphLike | GraphSchedule = "ring"
-    target: str | Target | Reference = "cv"
+    target: TargetLike = "cv"  # afterwards what moves
     target_spread: tuple[float, float] = (0.0, 0.0)
     sensor: str = "range-azimuth-elevation"
     sensor_sigma: Triple = (0.1, 0.02, 0.02)
@@ -361,7 +363,7 @@ class EstimationOptions(TargetTrackingOptions):
     graph: str | GraphLike | GraphSchedule = "chapter-6"
     rails: _Rows = CHAPTER_6_RAILS
     rail_velocity: Triple = (0.8, 0.3, -0.1)
-    target: str | Target | Reference = "chapter-6"
+    target: TargetLike = "chapter-6"
     target_spread: tuple[float, float] = (0.5, 0.5)
     prior_velocity: Triple = (0.8, 0.3, -0.1)
     prior_sigma: tuple[float, float] = (0.5, 0.5)

@@ -64,17 +64,17 @@ class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     rotor), `rate_limit` N/s per rotor,
         `tilt_limit` rad on |roll| and |pitch|, `velocity_limit` m/s on each body velocity, `position_limit`
         ((x, y, z) lower, (x, y, z) upper) m. No limit but kappa by default.
-    Task: `reference` (a name, the path of a table or a Reference), `start` (3 or 12 numbers, or "reference":
-        on it, with its velocity and heading), `start_box` (half widths: 1 or 3 numbers of the position or 12
-        of the state; 1 m, on the reference 0), `time_limit` 10 s (or "reference": as long as that is given),
-        `dt` 0.05 s, `substeps` 5, `preview`
-        25 stages of the reference in the observation, `Q` and `R` (diagonals, 1), `reward` "bounded" or
-        "quadratic", `lost_distance` 50 m.
-    Uncertainty: `disturbance` (a name, a Disturbance or None), `reveal_disturbance` (puts its mean over the
-    coming
-        period into the observation), `sensor_noise` (standard deviations of position m, velocity m/s,
-        attitude rad, rates rad/s, or one number for all), `randomize` (relative spread of mass, inertia, arm,
-        kappa, rotor_rate, drag at reset: a mapping or one number for all).
+    Task: `reference` (a name, or whatever `quad_envs.references.make_reference` takes), `start` (3 or 12
+        numbers, or "reference": on it, with its velocity and heading), `start_box` (half widths: 1 or 3
+        numbers of the position or 12 of the state; 1 m, on the reference 0), `time_limit` 10 s (or
+        "reference": as long as that is given), `dt` 0.05 s, `substeps` 5, `preview` 25 stages of the
+        reference in the observation, `Q` and `R` (diagonals, 1), `reward` "bounded" or "quadratic",
+        `lost_distance` 50 m.
+    Uncertainty: `disturbance` (None, a name, a force, or whatever `make_disturbance` takes),
+        `reveal_disturbance` (puts its mean over the coming period into the observation), `sensor_noise`
+        (standard deviations of position m, velocity m/s, attitude rad, rates rad/s, or one number for all),
+        `randomize` (relative spread of mass, inertia, arm, kappa, rotor_rate, drag at reset: a mapping or
+        one number for all).
 
     Rendering: `render_mode` None or "rgb_array" (`gymnasium.make` makes "human" of it), `render_size`
         (640, 480) pixels.

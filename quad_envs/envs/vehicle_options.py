@@ -10,7 +10,8 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
-from ..disturbances import Disturbance, beyond_authority, disturbance_of
+from ..disturbances import Disturbance, DisturbanceLike, beyond_authority, disturbance_of
+from ..kinds import as_tuple, is_number
 from ..names import shown, suggestion
 from ..parameters import N_INPUT, N_STATE, Limits, QuadrotorParams, Weights
 from ..references import Reference, in_episode, length_of, make_reference, mismatch
@@ -51,7 +52,7 @@ class VehicleOptions:
     position_limit: tuple[Triple, Triple] | None = None
     Q: float | tuple[float, ...] = 1.0
     R: float | tuple[float, ...] = 1.0
-    disturbance: str | Disturbance | None = None
+    disturbance: DisturbanceLike = None
     reveal_disturbance: bool = False
     sensor_noise: float | tuple[float, float, float, float] = 0.0
     randomize: float | Mapping[str, float] = 0.0
@@ -162,7 +163,7 @@ class VehicleOptions:
                 hint = suggestion(name, known)
                 raise TypeError(f"unexpected keyword argument {name!r} of {cls.kind} environment; {hint}")
         named = vehicle_values(kwargs["vehicle"]) if "vehicle" in kwargs else {}
-        values = named | {name: _as_tuple(value) for name, value in kwargs.items()}
+        values = named | {name: as_tuple(value) for name, value in kwargs.items()}
         return cls(**cls.that_follow(values) | values)
 
     @classmethod
@@ -247,11 +248,6 @@ class VehicleOptions:
         return {name: float(value) for name, value in ranges.items() if value > 0.0}
 
 
-def is_number(value: object) -> bool:
-    """Whether it is a finite number."""
-    return isinstance(value, int | float | np.integer | np.floating) and math.isfinite(value)
-
-
 def _is_vector(value: object) -> bool:
     """Whether it is three numbers, possibly infinite."""
     return (
@@ -259,13 +255,6 @@ def _is_vector(value: object) -> bool:
         and len(value) == 3
         and all(isinstance(entry, int | float | np.integer | np.floating) for entry in value)
     )
-
-
-def _as_tuple(value: Any) -> Any:
-    """Lists and arrays from configuration files and the command line become tuples."""
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
-    return tuple(_as_tuple(entry) for entry in value) if isinstance(value, list | tuple) else value
 
 
 def spread(name: str, value: float | tuple[float, ...], length: int) -> tuple[float, ...]:

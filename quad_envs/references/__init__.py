@@ -5,7 +5,8 @@ A trajectory of your own is `from_function(f)`, `from_csv(path)`, or any object 
 episode has `in_episode(dt, time_limit)`, which returns what is flown.
 """
 
-from .choices import ReferenceLike, is_table, make_reference
+from .arrays import ArrayTable
+from .choices import REFERENCES, ReferenceLike, is_table, make_reference, plain_reference
 from .episodes import in_episode, length_of, mismatch, state_on
 from .functions import from_function
 from .plausible import too_fast
@@ -25,6 +26,8 @@ from .trajectories import (
 )
 
 __all__ = [
+    "REFERENCES",
+    "ArrayTable",
     "ColumnTable",
     "CsvTable",
     "Heading",
@@ -46,6 +49,7 @@ __all__ = [
     "make_reference",
     "mismatch",
     "pack_rows",
+    "plain_reference",
     "state_on",
     "too_fast",
 ]

@@ -1,0 +1,127 @@
+"""Plain forms of what is flown: a mapping {"kind": name, field: value, ...} for a frozen dataclass.
+
+The kinds of a table are names -> a value with defaults, or a dataclass some of whose fields must be given.
+The fields and what they may be follow from these: nothing is listed twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, Field, fields, is_dataclass, replace
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from .names import shown, unknown_name
+
+Kinds: TypeAlias = Mapping[str, Any]
+Parts: TypeAlias = Mapping[str, Callable[[Any], Any]]
+_NUMBERS = (int, float, np.integer, np.floating)
+
+
+def as_tuple(value: Any) -> Any:
+    """Lists and arrays from configuration files and the command line become tuples."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    return tuple(as_tuple(entry) for entry in value) if isinstance(value, list | tuple) else value
+
+
+def make_kind(what: str, given: Mapping[str, Any], kinds: Kinds, parts: Parts | None = None) -> Any:
+    """The value of a mapping.
+
+    Args:
+        what: It is, for messages: "reference", "target", ...
+        given: "kind" and fields.
+        kinds: Name -> kind.
+        parts: Field -> what makes its value, of fields that hold another such value.
+
+    Raises:
+        ValueError: If the kind or a field is unknown or missing, or a value is not allowed.
+    """
+    if "kind" not in given:
+        raise ValueError(
+            f"a {what} as a mapping needs 'kind', one of {', '.join(kinds)}; got {shown(dict(given))}"
+        )
+    name = given["kind"]
+    if not isinstance(name, str) or name not in kinds:
+        raise ValueError(unknown_name(f"kind of {what}", name, kinds))
+    entry, known = kinds[name], _init_fields(kinds[name])
+    values: dict[str, Any] = {}
+    for key, value in given.items():
+        if key == "kind":
+            continue
+        if key not in known:
+            raise ValueError(unknown_name(f"field of the {what} {name!r}:", key, known))
+        values[key] = parts[key](value) if parts and key in parts else as_tuple(value)
+        _require_alike(f"{key} of the {what} {name!r}", values[key], _default(entry, known[key]))
+    if not isinstance(entry, type):
+        return replace(entry, **values)
+    missing = [key for key in known if key not in values and _default(entry, known[key]) is MISSING]
+    if missing:
+        raise ValueError(
+            f"the {what} {name!r} needs {', '.join(missing)}, as {{'kind': {name!r}, {missing[0]!r}: ...}}"
+        )
+    return entry(**values)
+
+
+def refuse_class(what: str, value: Any) -> None:
+    """Say that a value is wanted where its class is given.
+
+    Raises:
+        ValueError: If it is a class.
+    """
+    if isinstance(value, type):
+        name = value.__name__
+        raise ValueError(f"{what} must be a value, got the class {name}: write {name}(...)")
+
+
+def mapping_of(value: Any, kinds: Kinds, plain: Callable[[Any], Any]) -> dict[str, Any] | None:
+    """The mapping of a value, only of what differs from the kind's defaults; None if it is of no kind.
+
+    Args:
+        value: Any value.
+        kinds: Name -> kind.
+        plain: What makes the value of a field plain.
+    """
+    if not is_dataclass(value) or isinstance(value, type):
+        return None
+    for name, entry in kinds.items():
+        if (entry if isinstance(entry, type) else type(entry)) is not type(value):
+            continue
+        out: dict[str, Any] = {"kind": name}
+        for key, one in _init_fields(entry).items():
+            found, default = getattr(value, key), _default(entry, one)
+            if found is not default and not (type(found) is type(default) and found == default):
+                out[key] = plain(found)
+        return out
+    return None
+
+
+def _init_fields(entry: Any) -> dict[str, Field[Any]]:
+    return {one.name: one for one in fields(entry) if one.init}
+
+
+def _default(entry: Any, one: Field[Any]) -> Any:
+    return one.default if isinstance(entry, type) else getattr(entry, one.name)
+
+
+def _require_alike(what: str, value: Any, default: Any) -> None:
+    """Refuse a value that is no number where the default is one, no three numbers where it has three."""
+    if isinstance(default, bool):
+        fits, wanted = isinstance(value, bool), "true or false"
+    elif isinstance(default, int):
+        fits, wanted = isinstance(value, int | np.integer) and not isinstance(value, bool), "a whole number"
+    elif isinstance(default, float):
+        fits, wanted = is_number(value), f"a finite number, as {default!r}"
+    elif isinstance(default, tuple) and all(map(is_number, default)):
+        fits = isinstance(value, tuple) and len(value) == len(default) and all(map(is_number, value))
+        wanted = f"{len(default)} finite numbers, as {list(default)}"
+    else:
+        return  # its own check says more
+    if not fits:
+        raise ValueError(f"{what} must be {wanted}, got {shown(value)}")
+
+
+def is_number(value: Any) -> bool:
+    """Whether it is a finite number."""
+    return isinstance(value, _NUMBERS) and not isinstance(value, bool) and bool(np.isfinite(value))
