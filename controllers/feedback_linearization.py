@@ -27,6 +27,7 @@ from quad_envs.tasks import Task
 from .controller import FeedbackLaw, first_non_finite
 from .fallback import HOVER, NONE, limit_command
 from .mpc import Frame, require_choice
+from .mpc_kernels import governed
 from .ocp import IntArray
 
 KP, KD, KA, KAD = range(4)  # entries of the gains
@@ -48,13 +49,24 @@ def _inertial_velocity(plant: Array, out: Array) -> None:
 
 @kernel
 def _wanted_acceleration(
-    plant: Array, window: Array, d: Array, gains: Array, c: Array, dt: float, preview: bool, out: Array
+    plant: Array,
+    window: Array,
+    d: Array,
+    gains: Array,
+    c: Array,
+    dt: float,
+    preview: bool,
+    heading: bool,
+    out: Array,
 ) -> None:
     """u_i = a_ref - kp e - kd (v - v_ref) - d_force / m, in inertial axes."""
     _inertial_velocity(plant, out)
+    share = 1.0
+    if heading:
+        share = governed(plant[0] - window[0, 0], plant[1] - window[0, 1], plant[2] - window[0, 2])
     for i in range(3):
         a_ref = (window[1, 3 + i] - window[0, 3 + i]) / dt if preview else 0.0
-        error, rate = plant[i] - window[0, i], out[i] - window[0, 3 + i]
+        error, rate = share * (plant[i] - window[0, i]), out[i] - window[0, 3 + i]
         out[i] = a_ref - gains[KP] * error - gains[KD] * rate - c[INV_MASS] * d[3 + i]
     out[2] = min(out[2], _LARGEST_DESCENT * c[GRAVITY])
 
@@ -108,7 +120,7 @@ def _decide_rows(
         return bad
     u, F = scratch[0, :3], scratch[1]
     for j in range(plants.shape[0]):
-        _wanted_acceleration(plants[j], windows[j], disturbances[j], gains, c, dt, preview, u)
+        _wanted_acceleration(plants[j], windows[j], disturbances[j], gains, c, dt, preview, heading, u)
         psi_ref = math.atan2(windows[j, 0, 6], windows[j, 0, 7])
         _rotor_forces(plants[j], u, psi_ref, disturbances[j], gains, c, heading, F)
         level = NONE

@@ -28,6 +28,9 @@ from .solvers.working_set import pack_working_set, unpack_working_set
 MEMORY_STAGE = N_INPUT + 1  # numbers that a plan and its working set take per stage
 
 
+GOVERNOR_REACH = 6.0  # m: beyond the starts of every id; a linear model asked for 15 m flips the vehicle
+
+
 class MpcData(NamedTuple):
     """Constants of one controller, for compiled code."""
 
@@ -181,12 +184,22 @@ def rotor_lag(task: BaseTask) -> float:
 
 
 @kernel
+def governed(x: float, y: float, z: float) -> float:
+    """Share of a position error (x, y, z), m, that a controller is shown: all of it up to GOVERNOR_REACH."""
+    distance = math.sqrt(x * x + y * y + z * z)
+    return 1.0 if distance <= GOVERNOR_REACH else GOVERNOR_REACH / distance
+
+
+@kernel
 def set_references(plant: Array, window: Array, trim: Array, heading: bool, attitude: bool, r: Array) -> None:
     """Rows r_i = [p_ref; v_ref; trim phi, theta; psi_ref; 0] in the frame of the problem.
 
     The slot of V_B holds v_ref turned by the present heading, or by the whole present attitude, or (frame
     "hover", as in the dissertation) as it stands in inertial axes. psi_ref goes on continuously from row to
     row; the first is the one nearest to psi with `heading`, and in (-pi, pi] without.
+
+    With `heading`, a window that begins farther than GOVERNOR_REACH from the vehicle is moved towards it as a
+    whole; the dissertation's frame has no such governor.
 
     Args:
         plant: Measured, (16,).
@@ -229,6 +242,14 @@ def set_references(plant: Array, window: Array, trim: Array, heading: bool, atti
         r[i, 3], r[i, 4], r[i, 5] = ct * u - st * w, sf * down + cf * v, cf * down - sf * v
         r[i, 6], r[i, 7], r[i, 8] = trim[6], trim[7], trim[8] + yaw
         r[i, 9], r[i, 10], r[i, 11] = 0.0, 0.0, 0.0
+    if heading:
+        x, y, z = r[0, 0], r[0, 1], r[0, 2]
+        rest = 1.0 - governed(x, y, z)
+        if rest > 0.0:
+            for i in range(r.shape[0]):
+                r[i, 0] -= rest * x
+                r[i, 1] -= rest * y
+                r[i, 2] -= rest * z
 
 
 @kernel

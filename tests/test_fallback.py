@@ -49,9 +49,10 @@ def test_contradicting_hard_rows_are_relaxed(mpc, solver):
 
 
 def test_without_an_answer_the_previous_plan_is_flown_on(mpc):
-    good = decide_once(mpc(TIGHT, N), FAST, last=LAST)
+    """Stiff rows: softer ones are solved in a single step from the working set of the decision before."""
+    good = decide_once(mpc(TIGHT, N, soft_weight=1e3), FAST, last=LAST)
     plan = plan_of(good, N) + HOVER
-    stopped = mpc(TIGHT, N, iteration_limit=1)
+    stopped = mpc(TIGHT, N, soft_weight=1e3, iteration_limit=1)
     once = decide_once(stopped, FAST, last=good.command[0], memory=good.memory[0])
     assert once.fallback[0] == Fallback.PREVIOUS_PLAN
     np.testing.assert_allclose(once.command[0], plan[1], atol=1e-9)
