@@ -120,9 +120,11 @@ def test_a_shorter_time_limit_counts_the_same_in_single_and_vector_environments(
     assert one.steady_rms == other.steady_rms > 0.0
 
 
-def test_a_longer_time_limit_changes_nothing():
-    env = gymnasium.make(HELIX, max_episode_steps=500)
-    assert next(run_episodes(make_policy("hover", env), env, 1)).task == env.unwrapped.task
+def test_a_time_limit_put_around_an_environment_counts_where_it_is_the_shorter():
+    inner = gymnasium.make(HELIX)
+    for steps, flown in ((50, 50), (500, 200)):
+        env = gymnasium.wrappers.TimeLimit(inner, steps)
+        assert next(run_episodes(make_policy("hover", env), env, 1)).task.episode_steps == flown
 
 
 def test_a_vector_environment_that_resets_in_the_same_step_is_refused():

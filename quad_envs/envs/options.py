@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -13,6 +14,7 @@ from ..names import shown
 from ..observations import TrackingLayout
 from ..parameters import N_STATE, Array
 from ..references import ReferenceLike
+from ..registration import TIME_LIMIT, TRACKING
 from ..tasks import Task
 from .vehicle_options import CRASH_TILT, VehicleOptions
 
@@ -29,15 +31,34 @@ class TrackingOptions(VehicleOptions):
     start_box: float | tuple[float, ...] = 1.0
     preview: int = 25
     lost_distance: float = 50.0
+    max_episode_steps: int | None = None
     task: Task = field(init=False, repr=False, compare=False)  # made from the rest
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "reference", self.take_reference(self.reference))
+        reference = self.take_time_limit(self.reference)
+        self.take_steps()
+        object.__setattr__(self, "reference", self.within_episode(reference))
         VehicleOptions.__post_init__(self)
         self.require_positive("lost_distance")
         self.require_whole("preview", 0)
         object.__setattr__(self, "task", self._make_task())
         self.start_state()
+
+    def take_steps(self) -> None:
+        """The time limit of `max_episode_steps`, in place of the id's own; of two given, the shorter."""
+        if self.max_episode_steps is None:
+            return
+        self.require_whole("max_episode_steps", 1)
+        asked = self.max_episode_steps * self.dt
+        own = TRACKING.get(self.env_id, {}).get("time_limit", TIME_LIMIT)
+        if self.time_limit != own and abs(self.time_limit - asked) > 1e-6 * asked:
+            warnings.warn(
+                f"max_episode_steps={self.max_episode_steps} of dt = {self.dt:g} s are {asked:g} s, and "
+                f"time_limit={self.time_limit:g} s: the shorter holds; give one of them",
+                stacklevel=2,
+            )
+            asked = min(asked, self.time_limit)
+        object.__setattr__(self, "time_limit", asked)
 
     @classmethod
     def that_follow(cls, values: Mapping[str, Any]) -> dict[str, Any]:

@@ -252,7 +252,7 @@ class FormationOptions(TeamOptions):
 
     def __post_init__(self) -> None:
         self.take_cycles()
-        object.__setattr__(self, "reference", self.take_reference(self.reference))
+        object.__setattr__(self, "reference", self.within_episode(self.take_time_limit(self.reference)))
         TeamOptions.__post_init__(self)
 
     def make_slots(self) -> Array:

@@ -9,12 +9,14 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from ..episode_limit import steps_asked
 from ..parameters import Array
 from ..tasks import Task
 from .batch import TrackingBatch
 from .kernel import PLANT, SCORES, VALUES
 from .options import TrackingOptions
 from .pictures import NO_RENDERING, TrackingPictures, checked_rendering
+from .specified import Specified
 
 Observation = NDArray[np.float32]
 
@@ -22,7 +24,7 @@ Observation = NDArray[np.float32]
 _REWARD, _STAGE_COST, _COST, _EPISODE_COST, _VIOLATED, _CRASHED, _TRUNCATED, _CLIPPED = range(8)
 
 
-class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
+class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
     """A quadrotor follows a reference trajectory within limits.
 
     ## Description
@@ -67,9 +69,9 @@ class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     Task: `reference` (a name, or whatever `quad_envs.references.make_reference` takes), `start` (3 or 12
         numbers, or "reference": on it, with its velocity and heading), `start_box` (half widths: 1 or 3
         numbers of the position or 12 of the state; 1 m, on the reference 0), `time_limit` 10 s (or
-        "reference": as long as that is given), `dt` 0.05 s, `substeps` 5, `preview` 25 stages of the
-        reference in the observation, `Q` and `R` (diagonals, 1), `reward` "bounded" or "quadratic",
-        `lost_distance` 50 m.
+        "reference": as long as that is given) or `max_episode_steps`, as in `gymnasium.make`, `dt` 0.05 s,
+        `substeps` 5, `preview` 25 stages of the reference in the observation, `Q` and `R` (diagonals, 1),
+        `reward` "bounded" or "quadratic", `lost_distance` 50 m.
     Uncertainty: `disturbance` (None, a name, a force, or whatever `make_disturbance` takes),
         `reveal_disturbance` (puts its mean over the coming period into the observation), `sensor_noise`
         (standard deviations of position m, velocity m/s, attitude rad, rates rad/s, or one number for all),
@@ -89,6 +91,9 @@ class TrackingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480), **kwargs: Any
     ) -> None:
         size = checked_rendering(render_mode, ("rgb_array",), render_size)
+        asked = steps_asked()
+        if asked is not None:
+            kwargs["max_episode_steps"] = asked
         self.render_mode = render_mode
         self._batch = TrackingBatch(TrackingOptions.from_kwargs(kwargs), 1)
         self._pictures = TrackingPictures(self._batch, 0, size) if render_mode else None

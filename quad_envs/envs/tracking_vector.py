@@ -18,6 +18,7 @@ from .batch import TrackingBatch
 from .kernel import CRASHED, PLANT, REWARD, TRUNCATED
 from .options import TrackingOptions
 from .pictures import NO_RENDERING, TrackingPictures, checked_rendering
+from .specified import Specified
 from .vector_parts import Generators, score_infos, seeded, with_presence
 
 Observations = NDArray[np.float32]
@@ -25,13 +26,14 @@ Bools = NDArray[np.bool_]
 _Step = tuple[Observations, Array, Bools, Bools, dict[str, Any]]
 
 
-class TrackingVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]):
+class TrackingVectorEnv(
+    Specified, gymnasium.vector.VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
+):
     """n tracking tasks stepped in one compiled call, equal row by row to n `TrackingEnv` with the same seeds.
 
     Args:
         num_envs: Number of flights.
         autoreset_mode: Gymnasium's NEXT_STEP (default), SAME_STEP or DISABLED.
-        max_episode_steps: From `gymnasium.make_vec`; shortens the task's time limit.
         render_mode: None or "rgb_array".
         render_size: Width and height of each picture, pixels.
         kwargs: As for `TrackingEnv`.
@@ -45,7 +47,6 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.floa
         num_envs: int = 1,
         *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        max_episode_steps: int | None = None,
         render_mode: str | None = None,
         render_size: tuple[int, int] = (640, 480),
         **kwargs: Any,
@@ -54,9 +55,6 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.floa
             raise ValueError(f"num_envs must be >= 1, got {num_envs!r}")
         size = checked_rendering(render_mode, ("rgb_array",), render_size)
         options = TrackingOptions.from_kwargs(kwargs)
-        if max_episode_steps is not None:
-            limit = min(options.time_limit, max_episode_steps * options.dt)
-            options = TrackingOptions.from_kwargs({**kwargs, "time_limit": limit})
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {

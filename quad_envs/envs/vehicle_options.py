@@ -15,6 +15,7 @@ from ..kinds import as_tuple, is_number
 from ..names import shown, suggestion
 from ..parameters import N_INPUT, N_STATE, Limits, QuadrotorParams, Weights
 from ..references import Reference, in_episode, length_of, make_reference, mismatch
+from ..registration import DT, TIME_LIMIT
 from ..vehicles import vehicle_values
 
 # Arguments that are one number; what it may be is checked where it is used.
@@ -56,9 +57,9 @@ class VehicleOptions:
     reveal_disturbance: bool = False
     sensor_noise: float | tuple[float, float, float, float] = 0.0
     randomize: float | Mapping[str, float] = 0.0
-    dt: float = 0.05
+    dt: float = DT
     substeps: int = 5
-    time_limit: float = 10.0
+    time_limit: float = TIME_LIMIT
     reward: str = "bounded"
 
     def __post_init__(self) -> None:
@@ -103,11 +104,11 @@ class VehicleOptions:
         if excess:
             warnings.warn(excess, stacklevel=2)
 
-    def take_reference(self, what: object) -> Reference:
-        """The reference within these episodes; a time limit that follows from it is set.
+    def take_time_limit(self, what: object) -> Reference:
+        """The reference, from which a time limit of "reference" follows.
 
         Raises:
-            ValueError: If it is no reference, or nothing of it is flown.
+            ValueError: If it is no reference, or has no end.
         """
         made = make_reference(what)
         if isinstance(self.time_limit, str) and self.time_limit == "reference":
@@ -115,8 +116,7 @@ class VehicleOptions:
             object.__setattr__(self, "time_limit", length_of(made, self.dt))
         for name in ("dt", "time_limit"):
             self.require_positive(name)
-        fitted: Reference = self.within_episode(made)
-        return fitted
+        return made
 
     def within_episode(self, trajectory: Any) -> Any:
         """A reference or target as it is in these episodes; a warning says if it does not fit them."""

@@ -6,7 +6,7 @@ episode has `in_episode(dt, time_limit)`, which returns what is flown.
 """
 
 from .arrays import ArrayTable
-from .choices import REFERENCES, ReferenceLike, is_table, make_reference, plain_reference
+from .choices import REFERENCES, ReferenceLike, is_frame, is_table, make_reference, plain_reference
 from .episodes import in_episode, length_of, mismatch, state_on
 from .functions import from_function
 from .plausible import too_fast
@@ -44,6 +44,7 @@ __all__ = [
     "from_csv",
     "from_function",
     "in_episode",
+    "is_frame",
     "is_table",
     "length_of",
     "make_reference",

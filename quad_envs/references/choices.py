@@ -58,6 +58,11 @@ def is_table(what: object) -> bool:
     return isinstance(what, os.PathLike)
 
 
+def is_frame(what: object) -> bool:
+    """Whether it is a data frame, as of pandas or polars."""
+    return hasattr(what, "columns") and hasattr(what, "to_numpy")
+
+
 def plain_reference(what: Any) -> Reference | None:
     """A reference from a plain Python object: a mapping, a data frame, a function, an array; else None."""
     if isinstance(what, Mapping):
@@ -65,7 +70,7 @@ def plain_reference(what: Any) -> Reference | None:
             made: Reference = make_kind("reference", what, REFERENCES, {"reference": make_reference})
             return made
         return ColumnTable(what)
-    if hasattr(what, "columns") and hasattr(what, "to_numpy"):  # a data frame of pandas or polars
+    if is_frame(what):
         return ColumnTable({str(name): np.asarray(what[name]) for name in what.columns})
     if callable(what):
         return FunctionReference(what)
