@@ -9,7 +9,7 @@ from typing import Any
 
 from .contenders import contender_rows, contender_tables, find_contenders
 from .evaluation import NO_SPANNING_TREE, Evaluation
-from .metrics import paired_difference, totals, worst_violations
+from .metrics import paired_difference, said_causes, totals, worst_violations
 from .results import plain_json
 from .suite import EnvChoice, Suite
 from .table import format_number, format_table
@@ -100,7 +100,7 @@ class Results:
                     difference.mean,
                     difference.half_width,
                 )
-        row |= totals(ours.records)
+        row |= totals(ours.records) | {"crash_causes": said_causes(ours.records)}
         row["iterations_max"] = max(record.iterations_max for record in ours.records)
         row |= {f"worst_{name}": value for name, value in worst_violations(ours.records).items()}
         row |= _timed("decision", ours.decision_ms)

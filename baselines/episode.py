@@ -16,7 +16,12 @@ from .policy import N_FALLBACKS, Actions, Counts, PolicyState
 from .team_signals import TEAM_INFO, WRAPPER_INFO, estimate_signals
 
 SCORES = ("stage_cost", "cost", "constraint_violation")
-INFO = (*SCORES, "constraint_values", "crashed")  # keys that every environment of the suite tells
+INFO = (
+    *SCORES,
+    "constraint_values",
+    "crashed",
+    "crash_cause",
+)  # keys that every environment of the suite tells
 _N_ROTORS = 4
 
 
@@ -43,6 +48,9 @@ class Episode(NamedTuple):
     terminated: bool
     truncated: bool
     agent: str = ""  # in a multi-agent environment
+    crash_cause: str = (
+        ""  # one of `task.crash_causes`; empty too where another vehicle ended the team's flight
+    )
     team_size: int = 1  # vehicles that were decided for at once: the team took team_size * decision_times
     signals: Mapping[str, NDArray[Any]] = {}
 
@@ -86,6 +94,7 @@ class Recorder:
         self.live = np.ones(n, dtype=np.bool_)
         self.lengths = np.zeros(n, dtype=np.int64)
         self.ends = np.zeros((3, n), dtype=np.bool_)  # crashed, terminated, truncated
+        self.causes = np.zeros(n, dtype=np.int64)  # places in `task.crash_causes`
         self.fallbacks, self.worst = np.zeros((n, N_FALLBACKS), dtype=np.int64), np.zeros(n, dtype=np.int64)
         self.steps: list[tuple[NDArray[Any], Array, NDArray[Any]]] = []
         self.seconds: list[float] = []
@@ -126,6 +135,7 @@ class Recorder:
         self.plants.append(plants)
         self.lengths[live] += 1
         self.ends[:, live] = np.stack([info["crashed"], said.terminated, said.truncated])[:, live]
+        self.causes[live] = np.asarray(info["crash_cause"])[live]
         if isinstance(state, PolicyState):  # a policy that decides for the whole team has a single row
             n = len(live)
             self.fallbacks[live] = np.broadcast_to(state.fallbacks, (n, N_FALLBACKS))[live]
@@ -157,6 +167,7 @@ class Recorder:
                 terminated=bool(self.ends[1, j]),
                 truncated=bool(self.ends[2, j]),
                 agent=self.agents[j],
+                crash_cause=self.task.crash_causes[self.causes[j]],
                 team_size=self.team_size,
                 signals={name: entries[:steps, j].copy() for name, entries in signals.items()},
             )

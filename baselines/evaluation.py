@@ -17,8 +17,10 @@ from .metrics import (
     CUT_SHORT,
     Estimate,
     Record,
+    crash_causes,
     decision_quantiles,
     measure,
+    said_causes,
     summarize,
     totals,
     worst_violations,
@@ -90,6 +92,7 @@ class Evaluation:
             "episodes": self.flights,
             "summary": {name: value._asdict() for name, value in self.summary().items()},
             **totals(self.records),
+            "crash_causes": crash_causes(self.records),
             "iterations_max": max(record.iterations_max for record in self.records),
             "worst_violation": dict(worst_violations(self.records)),
             "decision_ms": {"p50": p50, "p99": p99, "max": slowest},
@@ -156,6 +159,8 @@ class Evaluation:
             lines.append(f"decisions of the whole team: {_times(self.team_ms)}")
         lines.append(f"counts: {counted}")
         worst = worst_violations(self.records)
+        if crash_causes(self.records):
+            lines.append(f"crashes by: {said_causes(self.records)}")
         if worst:
             lines.append("worst violation: " + ", ".join(f"{k} {format_number(v)}" for k, v in worst.items()))
         return "\n".join(lines)

@@ -10,6 +10,7 @@ A team gives one record per vehicle. Its vehicles are averaged within a flight b
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -61,6 +62,7 @@ class Record(NamedTuple):
     iterations_max: int  # most solver iterations of a decision
     worst_violation: dict[str, float]  # constraint name -> largest excess over its limit, SI
     agent: str = ""
+    crash_cause: str = ""  # one of `task.crash_causes`
     # Of a team's vehicle; nan where the task or the policy does not have them.
     formation_rms: float = _NAN  # m, distance to the own slot
     formation_final: float = _NAN  # m, its mean over the last second
@@ -134,6 +136,7 @@ def measure(episode: Episode) -> Record:
         iterations_max=episode.worst_iterations,
         worst_violation=dict(zip(task.constraint_names, excess.tolist(), strict=True)),
         agent=episode.agent,
+        crash_cause=episode.crash_cause,
         **measure_team(episode),
     )
 
@@ -246,6 +249,21 @@ def totals(records: Sequence[Record]) -> dict[str, int]:
     counts = {name: int(sum(getattr(record, name) for record in records)) for name in COUNTED}
     crashed = sum(any(record.crashed for record in team) for team in by_flight(records).values())
     return counts | {"crashed": crashed}
+
+
+def crash_causes(records: Sequence[Record]) -> dict[str, int]:
+    """Cause -> flights in which a vehicle crashed by it, the most frequent first."""
+    found = Counter(
+        cause
+        for team in by_flight(records).values()
+        for cause in {record.crash_cause for record in team} - {""}
+    )
+    return dict(found.most_common())
+
+
+def said_causes(records: Sequence[Record]) -> str:
+    """Those causes as words, "tilt 2, lost 1"."""
+    return ", ".join(f"{cause} {n}" for cause, n in crash_causes(records).items())
 
 
 def worst_violations(records: Sequence[Record]) -> Mapping[str, float]:

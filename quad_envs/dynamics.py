@@ -45,6 +45,7 @@ from .parameters import (
 )
 from .rotations import euler_rate_matrix, rotation_body_from_inertial, sincos
 
+LARGEST = 1e30  # sum of a plant's |entries| from which it is lost: float32 observations must hold it
 LANES = 32  # vehicles in one vectorised block: its scratch stays in the first-level cache
 
 # Rows of the integrator's scratch; entry i of lane j is w[i * stride + j].
@@ -312,11 +313,11 @@ def load_vehicle(
 
 @inline_kernel
 def store_vehicle(w: Array, j: Int, stride: Int, plant: Array) -> bool:
-    """Copy lane j to a plant row if it is finite, else leave the row as it was; returns whether it is."""
+    """Copy lane j to a plant row if its numbers are below LARGEST, else leave it; returns whether they are."""
     total = 0.0
     for i in range(N_STATE + N_INPUT):
         total += abs(w[(_X + i) * stride + j])
-    finite = total < np.inf
+    finite = total < LARGEST
     if finite:
         for i in range(N_STATE + N_INPUT):
             plant[i] = w[(_X + i) * stride + j]

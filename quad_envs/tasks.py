@@ -13,7 +13,7 @@ from .parameters import Array, Limits, QuadrotorParams, Weights
 
 _Triple = tuple[float, float, float]
 LOSS_PARTS = ("position", "velocity", "attitude", "rates", "effort", "formation")  # of the stage cost
-CRASH_CAUSES = ("", "distance", "tilt", "arena", "not finite")
+CRASH_CAUSES = ("", "distance", "tilt", "arena", "not finite", "lost")
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +38,11 @@ class BaseTask:
     def constraint_names(self) -> tuple[str, ...]:
         """Names of the entries of `info["constraint_values"]`."""
         return constraint_names(self.limits)
+
+    @property
+    def crash_causes(self) -> tuple[str, ...]:
+        """Names of the values of `info["crash_cause"]`, a number because TorchRL makes tensors of infos."""
+        return CRASH_CAUSES
 
     @property
     def hover_force(self) -> float:
@@ -84,11 +89,6 @@ class TeamTask(BaseTask):
     def reward_term_names(self) -> tuple[str, ...]:
         """Names of the entries of `info["reward_terms"]`."""
         return (*LOSS_PARTS, *self.constraint_names)
-
-    @property
-    def crash_causes(self) -> tuple[str, ...]:
-        """Names of the values of `info["crash_cause"]`, a number because TorchRL makes tensors of infos."""
-        return CRASH_CAUSES
 
     @property
     def action_size(self) -> int:

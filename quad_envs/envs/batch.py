@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,6 +13,7 @@ from ..disturbances import Disturbance
 from ..observations import N_REFERENCE
 from ..parameters import N_STATE, POSITION, Array
 from ..references import Reference, make_reference, state_on
+from .given import given_plants
 from .kernel import (
     COEFFICIENTS,
     COMMAND,
@@ -28,7 +28,6 @@ from .kernel import (
 )
 from .options import TrackingOptions
 from .tables import disturbance_rows, draw_vehicle, reference_rows, stage_times
-from .vehicle_options import CRASH_TILT
 
 _step = entry_of(step_rows)
 
@@ -164,14 +163,4 @@ class TrackingBatch:
         unknown = sorted(set(options) - {"state"})
         if unknown:
             raise ValueError(f"unknown reset option {unknown[0]!r}; known: 'state' (12 or 16 numbers)")
-        state = np.asarray(options["state"], dtype=np.float64)
-        if state.shape not in ((12,), (16,)) or not np.isfinite(state).all():
-            raise ValueError(
-                f"reset option 'state' must be 12 or 16 finite numbers, got {options['state']!r}"
-            )
-        if max(abs(state[6]), abs(state[7])) >= CRASH_TILT:
-            raise ValueError(
-                f"reset option 'state': roll and pitch must be below {math.degrees(CRASH_TILT):.0f} deg, "
-                f"got {state[6:8].tolist()} rad"
-            )
-        return state if state.size == 16 else np.concatenate([state, np.full(4, self.task.hover_force)])
+        return given_plants(options["state"], (), self.task.hover_force)

@@ -29,10 +29,9 @@ NEAREST = 66  # m, distance to the nearest vehicle, smallest over the substeps
 HEARD = 67  # messages received in this step
 ALIVE = 68
 MEASURES = 69  # whether it has the sensor
-CAUSE = 70  # why it crashed, index in `tasks.CRASH_CAUSES`
-TERMINATED = 71
-LEFT = 72  # whether it crashed in an earlier step
-TEAM_ROW_SIZE = 73
+TERMINATED = 70
+LEFT = 71  # whether it crashed in an earlier step
+TEAM_ROW_SIZE = 72
 
 # Entries of a message's content, absolute.
 N_MOTION = 10  # p 3, v 3 (inertial), phi, theta, sin psi, cos psi

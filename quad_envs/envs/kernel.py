@@ -16,7 +16,7 @@ from ..dynamics import LANES, SCRATCH_ROWS, advance, load_vehicle, store_vehicle
 from ..observations import N_OWN, encode_own, encode_preview
 from ..parameters import N_COEFFICIENTS, Array
 from ..reward import stage_cost_kernel
-from ..tasks import Task, TeamTask
+from ..tasks import CRASH_CAUSES, Task, TeamTask
 from .vehicle_options import CRASH_TILT
 
 # Entries of a vehicle's row.
@@ -25,9 +25,10 @@ COMMAND = slice(16, 20)  # last rotor commands, N
 COEFFICIENTS = slice(20, 20 + N_COEFFICIENTS)  # of the true vehicle
 FORCE_MAX = slice(36, 40)  # rotor saturation of the true vehicle, N
 REWARD, STAGE_COST, COST, EPISODE_COST, VIOLATED, CRASHED, TRUNCATED, CLIPPED, STEP = range(40, 49)
-SCORES = slice(40, 49)  # these nine
 VALUES = 49  # constraint values, one per named row, at most four
-ROW_SIZE = 53
+CAUSE = 53  # why it crashed, index in `tasks.CRASH_CAUSES`
+ROW_SIZE = 54
+SCORES = slice(40, 54)  # from the reward to the cause
 SCRATCH_SIZE = SCRATCH_ROWS * LANES + 4 * LANES + 16  # integrator, previous commands, one measured plant
 
 # Entries of the task vector. It ends with the diagonals of Q and R.
@@ -39,6 +40,7 @@ ACTION_MAX = slice(20, 24)  # force of action +1, N
 WEIGHT_Q = slice(24, 36)
 WEIGHT_R = slice(36, 40)
 
+_BY_TILT, _NOT_FINITE, _BY_LOSS = map(CRASH_CAUSES.index, ("tilt", "not finite", "lost"))
 BLOCK_FROM = 8  # rows from which a block of lanes is faster than one row at a time
 
 
@@ -124,14 +126,15 @@ def _judge(row: Array, reference: Array, previous: Array, finite: bool, task: Ar
     off = 0.0
     for i in range(3):
         off += (row[i] - reference[i]) ** 2
-    crashed = (
-        not finite
-        or abs(row[6]) >= task[TILT_OF_CRASH]
-        or abs(row[7]) >= task[TILT_OF_CRASH]
-        or off > task[LOST] * task[LOST]
-    )
+    row[CAUSE] = 0.0
+    if not finite:
+        row[CAUSE] = _NOT_FINITE
+    elif max(abs(row[6]), abs(row[7])) >= task[TILT_OF_CRASH]:
+        row[CAUSE] = _BY_TILT
+    elif off > task[LOST] * task[LOST]:
+        row[CAUSE] = _BY_LOSS
     stage_cost = stage_cost_kernel(row, reference, row[COMMAND], task[HOVER], task[WEIGHT_Q], task[WEIGHT_R])
-    score(row, stage_cost, violation_cost(row, previous, task), crashed, task)
+    score(row, stage_cost, violation_cost(row, previous, task), row[CAUSE] > 0.0, task)
 
 
 @inline_kernel

@@ -13,8 +13,9 @@ from pettingzoo import ParallelEnv
 from ..graphs import GraphTable
 from ..parameters import Array
 from ..tasks import TeamTask
-from .exchange import ALIVE, CAUSE, HEARD, NEAREST, SLOT_ERROR, TERMINATED, TERMS
+from .exchange import ALIVE, HEARD, NEAREST, SLOT_ERROR, TERMINATED, TERMS
 from .kernel import (
+    CAUSE,
     CLIPPED,
     COST,
     CRASHED,

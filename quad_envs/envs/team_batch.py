@@ -21,11 +21,11 @@ from ..references import make_reference, pack_rows
 from ..sensors import sensor_rows
 from ..targets import N_TARGET, make_target
 from .exchange import DISTURBANCE, DRAW, HEAD, MEASURES, NOISE, PLAN, REFERENCE, TARGET, TEAM_ROW_SIZE
+from .given import given_plants
 from .kernel import COEFFICIENTS, COMMAND, FORCE_MAX, PLANT, task_vector
 from .tables import checked_rows, disturbance_rows, draw_vehicle, reference_rows, stage_times
 from .team_kernel import begin_team, scratch_size, step_teams
 from .team_options import EstimationOptions, FormationOptions, TargetTrackingOptions, TeamOptions
-from .vehicle_options import CRASH_TILT
 
 _step = entry_of(step_teams)
 _RESET_OPTIONS = ("state",)
@@ -274,15 +274,4 @@ def _given_state(options: Mapping[str, Any] | None, n: int, hover: float) -> Arr
             raise ValueError(unknown_name("reset option", name, _RESET_OPTIONS))
     if not options or "state" not in options:
         return None
-    state = np.asarray(options["state"], dtype=np.float64)
-    if state.shape not in ((n, N_STATE), (n, N_STATE + 4)) or not np.isfinite(state).all():
-        raise ValueError(
-            f"reset option 'state' must be finite plants ({n}, 12) or ({n}, 16), one per vehicle, got shape "
-            f"{state.shape}"
-        )
-    if (np.abs(state[:, 6:8]) >= CRASH_TILT).any():
-        raise ValueError(
-            f"reset option 'state': roll and pitch must be below {math.degrees(CRASH_TILT):.0f} deg"
-        )
-    forces = np.full((n, 4), hover)
-    return state if state.shape[1] == N_STATE + 4 else np.concatenate([state, forces], axis=1)
+    return given_plants(options["state"], (n,), hover)

@@ -8,11 +8,10 @@ from .._numba import inline_kernel, kernel
 from ..constraints import TOLERANCE
 from ..parameters import Array
 from ..reward import stage_cost_parts
-from ..tasks import LOSS_PARTS
+from ..tasks import CRASH_CAUSES, LOSS_PARTS
 from .exchange import (
     ALIVE,
     ARENA,
-    CAUSE,
     CRASH_DISTANCE,
     FORMATION_WEIGHT,
     HAS_LEADER,
@@ -30,6 +29,7 @@ from .exchange import (
     Tables,
 )
 from .kernel import (
+    CAUSE,
     COMMAND,
     COST,
     CRASHED,
@@ -50,7 +50,7 @@ from .kernel import (
 )
 
 N_LOSS = len(LOSS_PARTS)
-_DISTANCE, _TILT, _ARENA, _NOT_FINITE = range(1, 5)  # places in `tasks.CRASH_CAUSES`
+_DISTANCE, _TILT, _ARENA, _NOT_FINITE = map(CRASH_CAUSES.index, ("distance", "tilt", "arena", "not finite"))
 
 
 @kernel

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..parameters import Array
 from ..tasks import TeamTask
-from .exchange import ALIVE, CAUSE, HEARD, NEAREST, SLOT_ERROR, TERMINATED, TERMS
+from .exchange import ALIVE, HEARD, NEAREST, SLOT_ERROR, TERMINATED, TERMS
 from .kernel import PLANT, REWARD, TRUNCATED
 from .team_batch import TeamBatch
 from .team_options import TeamOptions
@@ -162,7 +162,6 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
     def _info(self) -> dict[str, Any]:
         rows, n = self._batch.rows, len(self.task.constraint_names)
         info = score_infos(rows, n) | {
-            "crash_cause": rows[:, CAUSE].astype(np.int64),
             "formation_error": rows[:, SLOT_ERROR].copy(),
             "min_separation": rows[:, NEAREST].copy(),
             "messages": rows[:, HEARD].astype(np.int64),

@@ -13,7 +13,7 @@ from ..episode_limit import steps_asked
 from ..parameters import Array
 from ..tasks import Task
 from .batch import TrackingBatch
-from .kernel import PLANT, SCORES, VALUES
+from .kernel import CAUSE, PLANT, SCORES, VALUES
 from .options import TrackingOptions
 from .pictures import NO_RENDERING, TrackingPictures, checked_rendering
 from .specified import Specified
@@ -22,6 +22,7 @@ Observation = NDArray[np.float32]
 
 # Entries of SCORES.
 _REWARD, _STAGE_COST, _COST, _EPISODE_COST, _VIOLATED, _CRASHED, _TRUNCATED, _CLIPPED = range(8)
+_CAUSE = CAUSE - SCORES.start
 
 
 class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -51,12 +52,13 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
 
     ## Episode Termination
     Crash: |roll| or |pitch| >= 85 degrees, farther than `lost_distance` from the reference, or a state that
-    is no longer finite. Truncation after `time_limit`.
+    is no longer finite (or above 1e30). Truncation after `time_limit`.
 
     ## Info
     At every step and at reset: `cost` (sum of hinge / scale over the limits), `episode_cost` (its running
     sum), `constraint_violation` (bool), `constraint_values` (value minus limit of each of
-    `task.constraint_names`), `stage_cost`, `crashed`, `clipped_actions`.
+    `task.constraint_names`), `stage_cost`, `crashed`, `crash_cause` (place in `task.crash_causes`: 0 none,
+    2 "tilt", 4 "not finite", 5 "lost"), `clipped_actions`.
 
     ## Arguments
     Vehicle: `vehicle` (a name of `quad_envs.vehicles.VEHICLES`, whose values the others override), `frame`
@@ -177,5 +179,6 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
             "constraint_values": self._values.copy(),
             "stage_cost": scores[_STAGE_COST],
             "crashed": scores[_CRASHED] > 0.0,
+            "crash_cause": int(scores[_CAUSE]),
             "clipped_actions": int(scores[_CLIPPED]),
         }

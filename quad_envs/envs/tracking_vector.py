@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..parameters import Array
 from ..tasks import Task
 from .batch import TrackingBatch
+from .given import as_numbers
 from .kernel import CRASHED, PLANT, REWARD, TRUNCATED
 from .options import TrackingOptions
 from .pictures import NO_RENDERING, TrackingPictures, checked_rendering
@@ -157,7 +158,7 @@ class TrackingVectorEnv(
         """Start states from the reset options, one row per flight."""
         if state is None:
             return None
-        states = np.asarray(state, dtype=np.float64)
+        states = as_numbers(state)
         if states.ndim == 1:
             states = np.tile(states, (self.num_envs, 1))
         if states.ndim != 2 or len(states) != self.num_envs:

@@ -10,7 +10,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from ..parameters import Array
-from .kernel import CLIPPED, COST, CRASHED, EPISODE_COST, STAGE_COST, VALUES, VIOLATED
+from .kernel import CAUSE, CLIPPED, COST, CRASHED, EPISODE_COST, STAGE_COST, VALUES, VIOLATED
 
 Generators = list[np.random.Generator]
 
@@ -58,6 +58,7 @@ def score_infos(rows: Array, n_values: int) -> dict[str, Any]:
         "constraint_values": rows[:, VALUES : VALUES + n_values].copy(),
         "stage_cost": rows[:, STAGE_COST].copy(),
         "crashed": rows[:, CRASHED] > 0.0,
+        "crash_cause": rows[:, CAUSE].astype(np.int64),
         "clipped_actions": rows[:, CLIPPED].astype(np.int64),
     }
 
