@@ -313,7 +313,7 @@ def load_vehicle(
 
 @inline_kernel
 def store_vehicle(w: Array, j: Int, stride: Int, plant: Array) -> bool:
-    """Copy lane j to a plant row if its numbers are below LARGEST, else leave it; returns whether they are."""
+    """Copy lane j to a plant row if its numbers are below LARGEST, else leave it; whether they are."""
     total = 0.0
     for i in range(N_STATE + N_INPUT):
         total += abs(w[(_X + i) * stride + j])
