@@ -206,7 +206,7 @@ class FunctionDisturbance:
         given = [self.function(float(time)) for time in times.ravel()]
         try:
             out = np.array(given, dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             out = np.empty((0, 0))
         if out.ndim != 2 or out.shape[1] not in (3, 6):
             raise ValueError(

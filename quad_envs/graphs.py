@@ -108,7 +108,7 @@ def make_graph(what: GraphLike, formation: str | None, n: int) -> Array:
         return adjacency(n, what)  # type: ignore[arg-type]
     try:
         G = np.array(what, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(
             f"a graph is a name, an ({n}, {n}) matrix of weights or edges (sender, receiver), "
             f"got {shown(what)}"

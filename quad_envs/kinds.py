@@ -6,6 +6,7 @@ The fields and what they may be follow from these: nothing is listed twice.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, fields, is_dataclass, replace
 from typing import Any, TypeAlias
@@ -54,8 +55,17 @@ def make_kind(what: str, given: Mapping[str, Any], kinds: Kinds, parts: Parts | 
             raise ValueError(unknown_name(f"field of the {what} {name!r}:", key, known))
         values[key] = parts[key](value) if parts and key in parts else as_tuple(value)
         _require_alike(f"{key} of the {what} {name!r}", values[key], _default(entry, known[key]))
+    try:
+        return _made(what, name, entry, values)
+    except TypeError as error:
+        raise ValueError(f"the {what} {name!r} cannot be made of {shown(values)}: {error}") from None
+
+
+def _made(what: str, name: str, entry: Any, values: Mapping[str, Any]) -> Any:
+    """The value of a kind with these fields."""
     if not isinstance(entry, type):
         return replace(entry, **values)
+    known = _init_fields(entry)
     missing = [key for key in known if key not in values and _default(entry, known[key]) is MISSING]
     if missing:
         raise ValueError(
@@ -124,4 +134,9 @@ def _require_alike(what: str, value: Any, default: Any) -> None:
 
 def is_number(value: Any) -> bool:
     """Whether it is a finite number."""
-    return isinstance(value, _NUMBERS) and not isinstance(value, bool) and bool(np.isfinite(value))
+    if not isinstance(value, _NUMBERS) or isinstance(value, bool):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer beyond all floats
+        return False

@@ -2,6 +2,7 @@
 
 import math
 import pickle
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -359,3 +360,24 @@ def test_files_that_are_none_are_refused(tmp_path):
 def test_tables_travel_to_other_processes(tmp_path):
     reference = from_csv(write(tmp_path, text_of("t,x,y,z")))
     np.testing.assert_array_equal(rows_of(pickle.loads(pickle.dumps(reference))), rows_of(reference))
+
+
+def test_tables_with_random_mistakes_are_read_or_refused_and_nothing_else(tmp_path):
+    rng = np.random.default_rng(0)
+    pieces = [b",", b";", b"\n", b'"', b"nan", b"1e999", b"#", b"\t", b"-", b"\0", b"\xff", b"[deg]", b"t"]
+    forms = [text.encode() for text in (*FORMS.values(), polynomials())]
+    for k in range(400):
+        data = bytearray(forms[k % len(forms)])
+        for _ in range(rng.integers(1, 4)):
+            # Half of the mistakes are in the header.
+            at = int(rng.integers(60 if rng.random() < 0.5 else len(data)))
+            data[at : at + int(rng.integers(0, 3))] = pieces[rng.integers(len(pieces))]
+        (tmp_path / "table.csv").write_bytes(bytes(data))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                found = rows_of(from_csv(tmp_path / "table.csv"))
+            except ValueError as error:
+                assert "table.csv" in str(error) and len(str(error)) < 600
+            else:
+                assert np.isfinite(found).all()

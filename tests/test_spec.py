@@ -9,7 +9,7 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
 
-from baselines import evaluate, make_policy
+from baselines import evaluate, make_policy, run_episodes
 from quad_envs import Gusts, Heading, Helix, from_function
 from quad_envs.envs.tracking import TrackingEnv
 from quad_envs.registration import NMPC_SCORES, TRACKING
@@ -80,6 +80,18 @@ def test_the_whole_of_a_longer_episode_has_its_own_reference():
     env = gym.make(HELIX, max_episode_steps=500)
     t = 0.05 * np.arange(501)
     np.testing.assert_allclose(env.unwrapped.reference[:501, 2], 3.0 * t, atol=1e-9)
+
+
+def test_who_stays_behind_a_longer_helix_is_lost_on_the_way_and_who_follows_flies_all_of_it():
+    # The helix descends at 3 m/s: a vehicle that hovers is 50 m away after 16.65 s, whatever the limit says.
+    env = gym.make(HELIX, max_episode_steps=500)
+    env.reset(seed=0, options={"state": [0.0] * 12})
+    k = 0
+    while not env.step(STILL)[2]:
+        k += 1
+    assert k + 1 == 333
+    episode = next(run_episodes(make_policy("lmpc", env), env, 1))
+    assert episode.truncated and not episode.terminated and len(episode.rewards) == 500
 
 
 def test_vectors_and_environments_made_by_hand_take_the_steps_too():

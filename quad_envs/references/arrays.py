@@ -111,7 +111,7 @@ def array_of(values: Any) -> Array | None:
     """Rows as an array of float64; None if they are not of numbers."""
     try:
         out = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None
     return out
 

@@ -94,7 +94,7 @@ class FunctionReference:
         given = [self.function(float(time)) for time in t]
         try:
             out = np.array(given, dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise ValueError(f"{_WANTED} at every time, got {shown(given[0])} at first") from None
         if out.ndim != 2 or out.shape[1] not in (3, 4, 6, 7):
             raise ValueError(f"{_WANTED}, got shape {out.shape[1:]}")

@@ -182,7 +182,7 @@ class CsvTable(_TableForm):
 
     def __post_init__(self) -> None:
         self._check_form()
-        path = Path(self.path).expanduser()
+        path = _path_of(self.path)
         text = read_text_table(path, is_header)
         if are_polynomials(text.header):
             self._take(str(path), (), read_polynomials(path, text, self.axes or "flu"))
@@ -222,6 +222,8 @@ class ColumnTable(_TableForm):
 
     def __post_init__(self) -> None:
         self._check_form()
+        if not (isinstance(self.columns, Mapping) or hasattr(self.columns, "columns")):
+            raise ValueError(f"columns must be a mapping from names to lists, got {shown(self.columns)}")
         header = [str(name) for name in self.columns]
         columns, ignored = find_columns(header, "the table", self.names)
         values: dict[str, Array] = {}
@@ -236,7 +238,7 @@ class ColumnTable(_TableForm):
         """The numbers of a column, (n,)."""
         try:
             out = np.asarray(self.columns[name], dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             out = np.empty((0, 0))
         if out.ndim != 1:
             raise ValueError(f"the table's column {shown(name)} must be a list of numbers")
@@ -247,6 +249,16 @@ class ColumnTable(_TableForm):
 
 
 from_csv = CsvTable
+
+
+def _path_of(what: object) -> Path:
+    """A path whose ~ is the home folder."""
+    if not isinstance(what, str | os.PathLike):
+        raise ValueError(f"path must be that of a table, got {shown(what)}")
+    try:
+        return Path(what).expanduser()
+    except RuntimeError as error:
+        raise ValueError(f"{shown(str(what))}: {error}") from None
 
 
 def _numbers(
