@@ -219,7 +219,7 @@ def _check_kind(name: str, option: str, value: Any, default: Any) -> None:
     elif isinstance(default, int | float):
         fits = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
         kind = "a number"
-    elif isinstance(default, str):
+    elif isinstance(default, str) and default != "auto":  # "auto" stands for a number, too
         kind, fits = "a name", isinstance(value, str)
     else:
         return

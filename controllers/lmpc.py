@@ -14,8 +14,18 @@ from quad_envs.tasks import Task
 from .controller import first_non_finite
 from .disturbance import ESTIMATOR_GAIN
 from .model import hover_pair
-from .mpc import SOFT_WEIGHT, Frame, Mpc, MpcOptions, Problem, SolverName, VelocityReference
-from .mpc_kernels import MpcData, Scratch, begin_row, carve, end_row, hold_trim, solve_row
+from .mpc import (
+    PLAN_TILT,
+    SOFT_WEIGHT,
+    Frame,
+    Mpc,
+    MpcOptions,
+    Problem,
+    SolverName,
+    VelocityReference,
+    default_tilt,
+)
+from .mpc_kernels import MpcData, Scratch, begin_row, carve, end_row, hold_trim, solve_within_tilt
 from .ocp import IntArray
 from .solvers.structured import ITERATION_LIMIT, Workspace
 
@@ -49,7 +59,7 @@ def _decide_rows(
         begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
         hold_trim(A, s.trim, s.c)
         has_plan = memories[j, 0] > 0.0
-        level, iterations = solve_row(A, B, data.Q, data.P, stationary, s.r, has_plan, H, K, data, s, ws)
+        level, iterations = solve_within_tilt(A, B, data.Q, data.P, stationary, s.r, has_plan, data, s, ws)
         end_row(level, plants[j], lasts[j], disturbances[j], memories[j], data, s, ws.u, commands[j], kept[j])
         report[0, j], report[1, j] = level, iterations
     return bad
@@ -77,6 +87,8 @@ class LinearMPC(Mpc):
         iteration_limit: Largest number of active-set steps of a solve; 0 for one that grows with it.
         Q: Weight of the state, a number, the diagonal (12,) or a matrix; the reward's by default.
         R: Weight of the rotor forces, a number, the diagonal (4,) or a matrix; the reward's by default.
+        plan_tilt: Largest roll and pitch of a plan, rad, besides the task's limit: where the model holds.
+            None stands for 0.8 in frame "heading" and no such limit in frame "hover".
         terminal: Factor of P, the weight of x_N, or a matrix (12, 12) in its place.
 
     Raises:
@@ -98,6 +110,7 @@ class LinearMPC(Mpc):
         iteration_limit: int = ITERATION_LIMIT,
         Q: ArrayLike | None = None,
         R: ArrayLike | None = None,
+        plan_tilt: float | None = None,
         terminal: ArrayLike = 1.0,
     ) -> None:
         options = MpcOptions(
@@ -111,6 +124,7 @@ class LinearMPC(Mpc):
             iteration_limit,
             Q,
             R,
+            default_tilt(plan_tilt, PLAN_TILT, frame),
             terminal,
         )
         super().__init__(task, horizon, options, pairs=1, guess=False)

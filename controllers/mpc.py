@@ -25,9 +25,10 @@ from .mpc_kernels import (
     buffer_size,
     carve,
     end_row,
+    leaves_tilt,
     rotor_lag,
 )
-from .ocp import IntArray, OcpQp, StateRows, no_rows, output_rows
+from .ocp import IntArray, OcpQp, StateRows, concatenate_rows, no_rows, output_rows
 from .riccati import dare
 from .solvers import Backend, Status, StructuredSolver
 from .solvers.structured import Workspace, make_workspace
@@ -36,6 +37,9 @@ from .weights import require_turnable, terminal_weight, weight_matrix
 SolverName = Literal["structured", "osqp"]
 Frame = Literal["heading", "hover"]
 VelocityReference = Literal["heading", "attitude"]
+TILT_WEIGHT = 1e4  # per rad, of the rows that keep a plan inside its model; 1e3 gives way to heavy positions
+PLAN_TILT = 0.8  # rad, of models linear in the attitude
+EXACT_TILT = 1.0  # rad, of the exact model
 SOFT_WEIGHT = 25.0  # per SI unit: keeps the corridor's limits; from 30 on, 3 m outside walls, some flip
 
 
@@ -67,6 +71,7 @@ class MpcOptions:
     iteration_limit: int
     Q: ArrayLike | None = None  # weight of the state: number, diagonal (12,) or matrix; None: the reward's
     R: ArrayLike | None = None  # weight of the forces: number, diagonal (4,) or matrix; None: the reward's
+    plan_tilt: float = math.inf  # rad, largest roll and pitch of a plan, for the sake of its model
     terminal: ArrayLike = 1.0  # factor of P, the weight of x_N, or a matrix (12, 12) in the problem's axes
 
     def __post_init__(self) -> None:
@@ -81,6 +86,8 @@ class MpcOptions:
             )
         if not 0.0 < self.estimator_gain <= 1.0:
             raise ValueError(f"estimator_gain must lie in (0, 1], got {self.estimator_gain!r}")
+        if not self.plan_tilt > 0.0:
+            raise ValueError(f"plan_tilt must be > 0 rad, got {self.plan_tilt!r}; math.inf is no limit")
         if self.iteration_limit < 0:
             raise ValueError(
                 "iteration_limit must be at least 1, or 0 for one that grows with the problem, "
@@ -119,6 +126,24 @@ def limit_rows(limits: Limits, margin: float, weight: float, horizon: int) -> tu
     return rows, np.where(outputs < POSITION.stop, outputs, -1).astype(np.int64)
 
 
+def default_tilt(plan_tilt: float | None, usual: float, frame: Frame) -> float:
+    """The tilt that a plan keeps to, rad: as chosen, else the usual one, in the dissertation's frame none."""
+    if plan_tilt is not None:
+        return plan_tilt
+    return usual if frame == "heading" else math.inf
+
+
+def plan_tilt_rows(tilt: float, limits: Limits, horizon: int) -> StateRows:
+    """Rows that keep roll and pitch of a plan where its model holds; none where the task's limit does.
+
+    They are soft and stiff: `solve_within_tilt` takes them in only when a plan needs them.
+    """
+    if tilt >= limits.tilt or tilt == math.inf:
+        return no_rows()
+    bound = np.full(2, tilt)
+    return output_rows(np.eye(N_STATE)[ATTITUDE][:2], -bound, bound, TILT_WEIGHT, horizon)
+
+
 def mpc_data(task: BaseTask, horizon: int, options: MpcOptions) -> MpcData:
     """The constants of a controller."""
     params = task.params
@@ -127,7 +152,9 @@ def mpc_data(task: BaseTask, horizon: int, options: MpcOptions) -> MpcData:
     P = terminal_weight(options.terminal, dare(*hover_pair(params, task.dt), Q, R))
     if options.frame == "heading":
         require_turnable(Q)
-    rows, axis = limit_rows(task.limits, options.margin, options.soft_weight, horizon)
+    own, axis = limit_rows(task.limits, options.margin, options.soft_weight, horizon)
+    tilted = plan_tilt_rows(options.plan_tilt, task.limits, horizon)
+    rows = concatenate_rows(own, tilted)
     return MpcData(
         coefficients=params.coefficients(),
         B_c=params.input_matrix(),
@@ -135,7 +162,7 @@ def mpc_data(task: BaseTask, horizon: int, options: MpcOptions) -> MpcData:
         R=R,
         P=P,
         normals=rows.normals,
-        axis=axis,
+        axis=np.r_[axis, np.full(len(tilted.normals), -1, np.int64)],
         normal=rows.normal,
         stage=rows.stage,
         lower=rows.lower.copy(),  # without rows these are read-only views, another type to numba
@@ -149,6 +176,9 @@ def mpc_data(task: BaseTask, horizon: int, options: MpcOptions) -> MpcData:
         heading=options.frame == "heading",
         attitude=options.frame == "heading" and options.velocity_reference == "attitude",
         iteration_limit=int(options.iteration_limit),
+        plan_tilt=float(options.plan_tilt) if len(tilted.normals) else math.inf,
+        own_outputs=len(own.normals),
+        own_rows=len(own.normal),
     )
 
 
@@ -223,7 +253,7 @@ class Mpc(ABC):
         which, buffer, ws = self._scratch()
         s = carve(buffer, self.horizon, *self._sizes())
         begin_row(*row, which, self._data, s)
-        qp = self._as_qp(self._pose(0, row[-1], s, ws), s)
+        qp = self._as_qp(self._pose(0, row[-1], s, ws), s, *self._row_sets()[0])
         rows = StateRows._make(np.array(value) for value in qp.rows)
         return OcpQp._make(np.array(v) if isinstance(v, np.ndarray) else v for v in (*qp[:-1], rows))
 
@@ -298,14 +328,18 @@ class Mpc(ABC):
             from .solvers.osqp import OsqpSolver
 
             self._backend = OsqpSolver(persistent=False)  # rows must not depend on each other
-        qp = self._as_qp(problem, s)
-        solution = self._backend.solve(qp)
-        iterations = solution.iterations
-        if solution.status == Status.INFEASIBLE and level == NONE:
-            np.minimum(s.weight, RELAXED_WEIGHT, out=s.weight)
-            level = RELAXED
+        iterations = 0
+        for which in self._row_sets():
+            qp = self._as_qp(problem, s, *which)
             solution = self._backend.solve(qp)
             iterations += solution.iterations
+            if solution.status == Status.INFEASIBLE and level == NONE:
+                np.minimum(s.weight, RELAXED_WEIGHT, out=s.weight)
+                level = RELAXED
+                solution = self._backend.solve(qp)
+                iterations += solution.iterations
+            if solution.status != Status.OPTIMAL or not leaves_tilt(solution.x, self._data.plan_tilt):
+                break
         if solution.status != Status.OPTIMAL and has_plan:
             return PREVIOUS_PLAN, iterations
         if solution.status != Status.OPTIMAL:
@@ -317,9 +351,18 @@ class Mpc(ABC):
         ws.u[:], ws.x[:] = solution.u, solution.x
         return level, iterations
 
-    def _as_qp(self, problem: Problem, s: Scratch) -> OcpQp:
-        """The problem of one pass as data; views of the scratch memory."""
-        rows = StateRows(s.normals, self._data.normal, self._data.stage, s.row_lower, s.row_upper, s.weight)
+    def _row_sets(self) -> tuple[tuple[int, int], ...]:
+        """Outputs and rows of the task's limits, then with those of the plan's own tilt where it has one."""
+        own = self._data.own_outputs, self._data.own_rows
+        every = len(self._data.normals), len(self._data.normal)
+        return (own,) if own == every else (own, every)
+
+    def _as_qp(self, problem: Problem, s: Scratch, H: int, K: int) -> OcpQp:
+        """The problem of one pass as data, with H outputs and K rows; views of the scratch memory."""
+        data = self._data
+        rows = StateRows(
+            s.normals[:H], data.normal[:K], data.stage[:K], s.row_lower[:K], s.row_upper[:K], s.weight[:K]
+        )
         return OcpQp(
             *problem[:2], s.c, problem.Q, self._data.R, *problem[3:5], s.x_0, problem.r, s.lower, s.upper,
             self._data.rate_step, s.u_last, rows,

@@ -54,6 +54,9 @@ class MpcData(NamedTuple):
     heading: bool  # whether the problem is posed at the present position and heading
     attitude: bool  # whether v_ref is turned into the present body axes
     iteration_limit: int
+    plan_tilt: float  # rad, of the plan's own rows, inf for none
+    own_outputs: int  # outputs and rows of the task's limits, which stand first
+    own_rows: int
 
 
 class Scratch(NamedTuple):
@@ -403,6 +406,41 @@ def solve_row(
             rate_step = math.inf
             _widen(s.lower, s.upper)
             _widen(s.row_lower, s.row_upper)
+
+
+@kernel
+def leaves_tilt(x: Array, tilt: float) -> bool:
+    """Whether a plan (N+1, 12) rolls or pitches beyond an angle, rad."""
+    for i in range(1, x.shape[0]):
+        if abs(x[i, 6]) > tilt or abs(x[i, 7]) > tilt:
+            return True
+    return False
+
+
+@kernel
+def solve_within_tilt(
+    A: Array,
+    B: Array,
+    Q: Array,
+    Q_f: Array,
+    stationary: bool,
+    r: Array,
+    has_plan: bool,
+    data: MpcData,
+    s: Scratch,
+    ws: Workspace,
+) -> tuple[int, int]:
+    """`solve_row` with the task's rows; where the plan tilts beyond what its model holds, with its own, too.
+
+    Most plans never come near: to leave those rows out at first costs them nothing.
+    """
+    H, K = data.own_outputs, data.own_rows
+    level, iterations = solve_row(A, B, Q, Q_f, stationary, r, has_plan, H, K, data, s, ws)
+    if level <= RELAXED and leaves_tilt(ws.x, data.plan_tilt):
+        H, K = data.normals.shape[0], data.normal.shape[0]
+        again, count = solve_row(A, B, Q, Q_f, stationary, r, has_plan, H, K, data, s, ws)
+        level, iterations = max(level, again), iterations + count
+    return level, iterations
 
 
 @kernel

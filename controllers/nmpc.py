@@ -21,8 +21,18 @@ from .disturbance import ESTIMATOR_GAIN
 from .fallback import RELAXED
 from .linalg import copy, fill
 from .model import RK4_SCRATCH, rk4_sensitivities, rotated_derivatives
-from .mpc import SOFT_WEIGHT, Frame, Mpc, MpcOptions, Problem, SolverName, require_choice
-from .mpc_kernels import MpcData, Scratch, begin_row, carve, copy_vector, end_row, solve_row
+from .mpc import (
+    EXACT_TILT,
+    SOFT_WEIGHT,
+    Frame,
+    Mpc,
+    MpcOptions,
+    Problem,
+    SolverName,
+    default_tilt,
+    require_choice,
+)
+from .mpc_kernels import MpcData, Scratch, begin_row, carve, copy_vector, end_row, solve_within_tilt
 from .ocp import IntArray
 from .solvers.structured import ITERATION_LIMIT, Workspace
 
@@ -217,7 +227,7 @@ def _decide_rows(
             linearise_model(data, s)
             linearise_cost(inertial, data, s)
             has_plan = memories[j, 0] > 0.0
-            level, count = solve_row(s.A, s.B, s.Q, s.P, False, s.target, has_plan, H, K, data, s, ws)
+            level, count = solve_within_tilt(s.A, s.B, s.Q, s.P, False, s.target, has_plan, data, s, ws)
             worst, iterations = max(worst, level), iterations + count
             if level > RELAXED or take_step(ws.u, ws.x, s) < CONVERGED:
                 break
@@ -246,6 +256,8 @@ class ExactNmpc(Mpc):
         iteration_limit: Largest number of active-set steps of a solve; 0 for one that grows with it.
         Q: Weight of the state, a number, the diagonal (12,) or a matrix; the reward's by default.
         R: Weight of the rotor forces, a number, the diagonal (4,) or a matrix; the reward's by default.
+        plan_tilt: Largest roll and pitch of a plan, rad, besides the task's limit: where the model holds.
+            None stands for 1.0 in frame "heading" and no such limit in frame "hover".
         terminal: Factor of P, the weight of x_N, or a matrix (12, 12) in its place.
 
     Raises:
@@ -268,6 +280,7 @@ class ExactNmpc(Mpc):
         iteration_limit: int = ITERATION_LIMIT,
         Q: ArrayLike | None = None,
         R: ArrayLike | None = None,
+        plan_tilt: float | None = None,
         terminal: ArrayLike = 1.0,
     ) -> None:
         if passes != int(passes) or passes < 1:
@@ -275,7 +288,7 @@ class ExactNmpc(Mpc):
         require_choice("velocity_error", velocity_error, VelocityError)
         options = MpcOptions(
             solver, frame, "heading", soft_weight, margin, reject_disturbance, estimator_gain,
-            iteration_limit, Q, R, terminal,
+            iteration_limit, Q, R, default_tilt(plan_tilt, EXACT_TILT, frame), terminal,
         )  # fmt: skip
         super().__init__(task, horizon, options, pairs=horizon, guess=True)
         self.passes = int(passes)

@@ -16,13 +16,34 @@ from .disturbance import ESTIMATOR_GAIN
 from .fallback import RELAXED
 from .linalg import copy
 from .model import sdc_matrix, zero_order_hold
-from .mpc import SOFT_WEIGHT, Frame, Mpc, MpcOptions, Problem, SolverName, VelocityReference, require_choice
-from .mpc_kernels import MpcData, Scratch, begin_row, carve, copy_vector, end_row, hold_trim, solve_row
+from .mpc import (
+    PLAN_TILT,
+    SOFT_WEIGHT,
+    Frame,
+    Mpc,
+    MpcOptions,
+    Problem,
+    SolverName,
+    VelocityReference,
+    default_tilt,
+    require_choice,
+)
+from .mpc_kernels import (
+    MpcData,
+    Scratch,
+    begin_row,
+    carve,
+    copy_vector,
+    end_row,
+    hold_trim,
+    solve_within_tilt,
+)
 from .ocp import IntArray
 from .riccati import solve_dare
 from .solvers.structured import ITERATION_LIMIT, Workspace
 
 TerminalWeight = Literal["hover", "sdre"]
+FROZEN_SPAN = 0.5  # rad, of roll, pitch or yaw along a plan, for which the pair at its start still serves
 _TILT_LIMIT = 1.4  # rad, of roll and pitch of the states at which the model is taken again
 
 
@@ -64,6 +85,16 @@ def relinearise(u: Array, alpha: float, data: MpcData, s: Scratch) -> None:
 
 
 @kernel
+def leaves_pair(x: Array) -> bool:
+    """Whether a plan (N+1, 12) rolls, pitches or yaws so far that the pair at its start no longer holds."""
+    for i in range(1, x.shape[0]):
+        for a in range(6, 9):
+            if abs(x[i, a] - x[0, a]) > FROZEN_SPAN:
+                return True
+    return False
+
+
+@kernel
 def _decide_rows(
     plants: Array,
     windows: Array,
@@ -76,6 +107,7 @@ def _decide_rows(
     which: IntArray | None,
     alpha: float,
     relinearisations: int,
+    at_need: bool,
     sdre_weight: bool,
     data: MpcData,
     buffer: Array,
@@ -99,11 +131,11 @@ def _decide_rows(
                 relinearise(ws.u, alpha, data, s)
                 stationary, pairs = False, N
             has_plan = memories[j, 0] > 0.0
-            level, count = solve_row(
-                s.A[:pairs], s.B[:pairs], data.Q, s.P, stationary, s.r, has_plan, H, K, data, s, ws
+            level, count = solve_within_tilt(
+                s.A[:pairs], s.B[:pairs], data.Q, s.P, stationary, s.r, has_plan, data, s, ws
             )
             worst, iterations = max(worst, level), iterations + count
-            if level > RELAXED:
+            if level > RELAXED or (at_need and not leaves_pair(ws.x)):
                 break
         end_row(worst, plants[j], lasts[j], disturbances[j], memories[j], data, s, ws.u, commands[j], kept[j])
         report[0, j], report[1, j] = worst, iterations
@@ -122,8 +154,8 @@ class SdcNmpc(Mpc):
         task: What is known of the flight.
         horizon: N, samples.
         alpha: Member of the family of factorisations, in [0, 1]; see `model.sdc_matrix`.
-        relinearisations: Further passes, each with the pairs along the plan of the pass before; 0 is the
-            dissertation's.
+        relinearisations: Further passes, each with the pairs along the plan of the pass before. "auto" makes
+            one where the plan turns by more than FROZEN_SPAN, none in frame "hover"; 0 is the dissertation's.
         terminal_weight: "hover": P of the hover model; "sdre": P of the present pair.
         solver: See `LinearMPC`, as the options that follow.
         frame: "heading" or "hover".
@@ -135,6 +167,8 @@ class SdcNmpc(Mpc):
         iteration_limit: Largest number of active-set steps of a solve; 0 for one that grows with it.
         Q: Weight of the state, a number, the diagonal (12,) or a matrix; the reward's by default.
         R: Weight of the rotor forces, a number, the diagonal (4,) or a matrix; the reward's by default.
+        plan_tilt: Largest roll and pitch of a plan, rad, besides the task's limit: where the model holds.
+            None stands for 0.8 in frame "heading" and no such limit in frame "hover".
         terminal: Factor of P, the weight of x_N, or a matrix (12, 12) in its place.
 
     Raises:
@@ -146,7 +180,7 @@ class SdcNmpc(Mpc):
         task: Task,
         horizon: int = 25,
         alpha: float = 1.0,
-        relinearisations: int = 0,
+        relinearisations: int | Literal["auto"] = "auto",
         terminal_weight: TerminalWeight = "hover",
         *,
         solver: SolverName = "structured",
@@ -159,14 +193,21 @@ class SdcNmpc(Mpc):
         iteration_limit: int = ITERATION_LIMIT,
         Q: ArrayLike | None = None,
         R: ArrayLike | None = None,
+        plan_tilt: float | None = None,
         terminal: ArrayLike = 1.0,
     ) -> None:
         if not 0.0 <= alpha <= 1.0:
             raise ValueError(
                 f"alpha must lie in [0, 1], got {alpha!r}; 1/2 is the dissertation's, 1 recommended"
             )
-        if relinearisations != int(relinearisations) or relinearisations < 0:
-            raise ValueError(f"relinearisations must be a whole number >= 0, got {relinearisations!r}")
+        if relinearisations == "auto":
+            passes = 1 if frame == "heading" else 0
+        elif isinstance(relinearisations, int | np.integer) and relinearisations >= 0:
+            passes = int(relinearisations)
+        else:
+            raise ValueError(
+                f"relinearisations must be 'auto' or a whole number >= 0, got {relinearisations!r}"
+            )
         require_choice("terminal_weight", terminal_weight, TerminalWeight)
         options = MpcOptions(
             solver,
@@ -179,6 +220,7 @@ class SdcNmpc(Mpc):
             iteration_limit,
             Q,
             R,
+            default_tilt(plan_tilt, PLAN_TILT, frame),
             terminal,
         )
         if terminal_weight == "sdre" and (np.ndim(terminal) > 0 or terminal != 1.0):
@@ -186,15 +228,24 @@ class SdcNmpc(Mpc):
                 "terminal changes P of the hover model; terminal_weight='sdre' has another P at each sample: "
                 "leave terminal out, or choose terminal_weight='hover'"
             )
-        super().__init__(task, horizon, options, pairs=horizon if relinearisations else 1, guess=False)
+        super().__init__(task, horizon, options, pairs=horizon if passes else 1, guess=False)
         self.alpha = float(alpha)
-        self.relinearisations = int(relinearisations)
+        self.relinearisations, self._at_need = passes, relinearisations == "auto"
         self.terminal_weight = terminal_weight
 
     def _decide_rows(self, *arrays: Any) -> int:
         which, buffer, ws = self._scratch()
         sdre_weight = self.terminal_weight == "sdre"
-        constants = (which, self.alpha, self.relinearisations, sdre_weight, self._data, buffer, ws)
+        constants = (
+            which,
+            self.alpha,
+            self.relinearisations,
+            self._at_need,
+            sdre_weight,
+            self._data,
+            buffer,
+            ws,
+        )
         arguments: tuple[Any, ...] = (*arrays, *constants)
         return _decide_rows(*arguments)
 
@@ -208,4 +259,4 @@ class SdcNmpc(Mpc):
         return Problem(s.A[:pairs], s.B[:pairs], self._data.Q, s.P, stationary, s.r)
 
     def _accept(self, number: int, s: Scratch, ws: Workspace) -> bool:
-        return number == self.relinearisations
+        return number == self.relinearisations or (self._at_need and not leaves_pair(ws.x))

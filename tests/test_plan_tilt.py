@@ -1,0 +1,100 @@
+"""Plans keep to the tilt for which their model holds; SDC-NMPC takes its model again where they turn far."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from flights import at_rest, decide_once
+
+import quad_envs  # noqa: F401  registers the ids
+from baselines import evaluate, make_policy
+from controllers import ExactNmpc, LinearMPC, SdcNmpc
+from controllers.mpc_kernels import leaves_tilt
+from quad_envs.parameters import Limits
+from quad_envs.tasks import Task
+
+HEAVY = [100.0] * 3 + [0.01] * 9
+FLAVOURS = [LinearMPC, SdcNmpc, ExactNmpc]
+FAR = at_rest((5.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("flavour", FLAVOURS)
+def test_a_plan_that_would_tilt_too_far_is_made_again_within_the_tilt(flavour):
+    """The command is that of an MPC whose task has the same limit."""
+    chosen = 0.5
+    free = decide_once(flavour(Task(), 15, Q=HEAVY, plan_tilt=np.inf), FAR)
+    kept = decide_once(flavour(Task(), 15, Q=HEAVY, plan_tilt=chosen), FAR)
+    own = decide_once(
+        flavour(Task(limits=Limits(tilt=chosen)), 15, Q=HEAVY, soft_weight=1e4, margin=0.0, plan_tilt=np.inf),
+        FAR,
+    )
+    assert np.abs(free.command - kept.command).max() > 1e-3
+    np.testing.assert_allclose(kept.command, own.command, atol=1e-7)  # the same optimum of two active sets
+
+
+@pytest.mark.parametrize("flavour", FLAVOURS)
+def test_a_plan_that_stays_level_is_the_one_without_the_rows(flavour):
+    free, kept = (
+        decide_once(flavour(Task(), 15, plan_tilt=tilt), at_rest((0.3, -0.2, 0.1))) for tilt in (np.inf, 0.8)
+    )
+    np.testing.assert_array_equal(free.command, kept.command)
+
+
+@pytest.mark.parametrize("flavour", FLAVOURS)
+def test_both_solvers_keep_to_the_tilt(flavour):
+    """OSQP stops at residuals of 1e-5."""
+    exact, approximate = (
+        decide_once(flavour(Task(), 10, Q=[10.0] * 3 + [0.1] * 9, solver=solver), FAR).command
+        for solver in ("structured", "osqp")
+    )
+    np.testing.assert_allclose(approximate, exact, atol=1e-2)
+
+
+def test_leaves_tilt_looks_at_roll_and_pitch_of_what_is_planned():
+    x = np.zeros((4, 12))
+    x[0, 6] = x[3, 8] = 2.0  # the present roll and a yaw do not count
+    assert not leaves_tilt(x, 0.8)
+    x[2, 7] = -0.9
+    assert leaves_tilt(x, 0.8) and not leaves_tilt(x, np.inf)
+
+
+@pytest.mark.parametrize("tilt", [0.0, -1.0, np.nan])
+def test_a_tilt_that_is_none_is_refused(tilt):
+    with pytest.raises(ValueError, match="plan_tilt must be > 0 rad"):
+        LinearMPC(Task(), plan_tilt=tilt)
+
+
+@pytest.mark.parametrize("passes", ["always", -1, 1.5])
+def test_relinearisations_are_auto_or_a_whole_number(passes):
+    with pytest.raises(ValueError, match="'auto' or a whole number >= 0"):
+        SdcNmpc(Task(), relinearisations=passes)
+
+
+def test_by_itself_sdc_nmpc_relinearises_where_the_plan_turns_far_and_only_there():
+    for plant, passes in ((at_rest((0.01, 0.0, 0.0)), 0), (FAR, 1)):
+        auto, fixed = (
+            decide_once(SdcNmpc(Task(), 15, Q=HEAVY, relinearisations=number), plant).command
+            for number in ("auto", passes)
+        )
+        np.testing.assert_array_equal(auto, fixed)
+    assert SdcNmpc(Task(), frame="hover").relinearisations == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("horizon", [10, 25, 60])
+@pytest.mark.parametrize("reference", ["helix", "spiral", "lemniscate"])
+def test_whatever_the_weights_nobody_loses_a_vehicle_and_sdc_nmpc_is_no_worse_than_lmpc(reference, horizon):
+    """1.1 of the cost: at N = 10 on the lemniscate one relinearisation costs 8 %."""
+    for position in (1.0, 10.0, 100.0):
+        for rest in (1.0, 0.1, 0.01):
+            env = gym.make(
+                "quad/HelixTracking-v0",
+                Q=(position,) * 3 + (rest * position if position < 100.0 else rest,) * 9,
+                reference=reference,
+                preview=max(horizon, 25),
+            )
+            found = {
+                name: evaluate(make_policy(name, env, horizon=horizon), env, episodes=1).records[0]
+                for name in ("lmpc", "sdc-nmpc", "nmpc")
+            }
+            assert not any(record.crashed for record in found.values()), (position, rest)
+            assert found["sdc-nmpc"].cost <= 1.1 * found["lmpc"].cost, (position, rest)
