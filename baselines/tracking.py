@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controllers.controller import Controller, Decision
+from controllers.controller import TURNING_ROWS, Controller, Decision
 from quad_envs._numba import kernel
 from quad_envs.constraints import action_from_force, forces_from_actions
 from quad_envs.observations import N_OWN, N_REFERENCE, decode_own
@@ -124,7 +124,8 @@ class ControllerPolicy:
 
     def __init__(self, controller: Controller, task: Task, name: str) -> None:
         self.controller, self.task, self.name = controller, task, name
-        self._size, self._stages = task.layout.size, controller.horizon + 1
+        self._size = task.layout.size
+        self._stages = max(controller.horizon + 1, min(task.layout.preview + 1, TURNING_ROWS))
         self._hover, self._force_max = float(task.hover_force), task.force_max
         self._sees = bool(task.layout.position), bool(task.layout.disturbance)
 

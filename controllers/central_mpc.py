@@ -27,6 +27,7 @@ from quad_envs.observations import N_REFERENCE
 from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, VELOCITY, Array
 from quad_envs.rotations import rotation_body_from_inertial, wrap_angle
 from quad_envs.tasks import TeamTask
+from quad_envs.turning import TURN_RATE, turning_rates, with_turn_rates
 
 from .controller import PLANT_SIZE, Decision, as_array
 from .disturbance import ESTIMATOR_GAIN
@@ -209,6 +210,7 @@ class CentralMpc:
     def _condense(self, plants: Array, rows: Array, slots: Array) -> list[Condensed]:
         """Each vehicle's dynamics and cost in its inputs, inertial axes."""
         data, N, found = self._data, self.horizon, []
+        psi_dot = with_turn_rates(rows, self.task.dt)[:, TURN_RATE]
         for plant, slot in zip(plants, slots, strict=True):
             x = plant[:N_STATE].copy()
             add_rotor_lag(plant, np.full(N_INPUT, self.task.hover_force), data.B_c, data.lag, x)
@@ -216,6 +218,7 @@ class CentralMpc:
             r = np.zeros((N + 1, N_STATE))
             r[:, POSITION] = rows[:, :3] + slot
             r[:, VELOCITY] = rows[:, 3:6] @ rotation_body_from_inertial(x[ATTITUDE]).T
+            r[:, 9:12] = turning_rates(x[ATTITUDE], psi_dot)
             r[:, 8] = x[8] + wrap_angle(np.arctan2(rows[:, 6], rows[:, 7]) - x[8])
             P = level_frame_weight(data.P, x[ATTITUDE])
             zero, box = np.zeros(N_INPUT), np.full(N_INPUT, math.inf)

@@ -17,6 +17,7 @@ from .disturbance import N_DISTURBANCE
 from .ocp import IntArray
 
 PLANT_SIZE = N_STATE + N_INPUT
+TURNING_ROWS = 3  # rows of a window from which a law without preview reads how the heading turns
 _NAMES = ("plant", "window", "last_command", "disturbance", "memory")
 
 

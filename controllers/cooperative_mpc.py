@@ -161,7 +161,7 @@ class CooperativeMpc:
         separation = self.avoidance.layout(slots, self.horizon)
         rows = concatenate_rows(limits, separation)
         axis = np.concatenate([data.axis, np.full(len(separation.normals), -1)])
-        self._data = data._replace(**rows._asdict(), axis=axis)
+        self._data = data._replace(**rows._asdict(), axis=axis, kinematics=True)
         self._layout = RowLayout(
             alpha, alpha if turning else 0.0, stage_weight, len(limits.normals), len(limits.normal),
             len(separation.normals) // max(slots, 1), len(separation.normal) // max(slots, 1),

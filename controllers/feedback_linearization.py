@@ -23,8 +23,9 @@ from quad_envs.parameters import (
 )
 from quad_envs.rotations import sincos, wrap_angle_scalar
 from quad_envs.tasks import Task
+from quad_envs.turning import turn_rate
 
-from .controller import FeedbackLaw, first_non_finite
+from .controller import TURNING_ROWS, FeedbackLaw, first_non_finite
 from .fallback import HOVER, NONE, limit_command
 from .mpc import Frame, require_choice
 from .mpc_kernels import governed
@@ -72,12 +73,31 @@ def _wanted_acceleration(
 
 
 @kernel
+def _wanted_rates(plant: Array, psi_dot: float, heading: bool) -> tuple[float, float, float]:
+    """E(Theta) [0, 0, psi_dot]; with Euler rates for body rates, as in the text, [0, 0, psi_dot]."""
+    if not heading:
+        return 0.0, 0.0, psi_dot
+    sf, cf = sincos(plant[6])
+    st, ct = sincos(plant[7])
+    return -psi_dot * st, psi_dot * sf * ct, psi_dot * cf * ct
+
+
+@kernel
 def _rotor_forces(
-    plant: Array, u: Array, psi_ref: float, d: Array, gains: Array, c: Array, heading: bool, F: Array
+    plant: Array,
+    u: Array,
+    psi_ref: float,
+    psi_dot: float,
+    d: Array,
+    gains: Array,
+    c: Array,
+    heading: bool,
+    F: Array,
 ) -> None:
     """Thrust and attitude for the acceleration u, torques for the attitude, rotor forces for both."""
     phi, theta, psi = plant[6], plant[7], plant[8]
     p, q, r = plant[9], plant[10], plant[11]
+    p_d, q_d, r_d = _wanted_rates(plant, psi_dot, heading)
     sine, cosine = sincos(psi if heading else 0.0)
     ahead, aside = cosine * u[0] + sine * u[1], cosine * u[1] - sine * u[0]
     lift = c[GRAVITY] - u[2]
@@ -86,9 +106,9 @@ def _rotor_forces(
     phi_d = math.asin(aside / specific)
     yaw_error = wrap_angle_scalar(psi - psi_ref) if heading else psi - psi_ref
     # Torques over the moments of inertia, then split among the rotors: M^-1 [T; tau].
-    alpha_x = -c[GYRO_X] * q * r - gains[KA] * (phi - phi_d) - gains[KAD] * p - c[INV_JX] * d[0]
-    alpha_y = -c[GYRO_Y] * p * r - gains[KA] * (theta - theta_d) - gains[KAD] * q - c[INV_JY] * d[1]
-    alpha_z = -c[GYRO_Z] * p * q - _YAW_STIFFNESS * yaw_error - _YAW_DAMPING * r - c[INV_JZ] * d[2]
+    alpha_x = -c[GYRO_X] * q * r - gains[KA] * (phi - phi_d) - gains[KAD] * (p - p_d) - c[INV_JX] * d[0]
+    alpha_y = -c[GYRO_Y] * p * r - gains[KA] * (theta - theta_d) - gains[KAD] * (q - q_d) - c[INV_JY] * d[1]
+    alpha_z = -c[GYRO_Z] * p * q - _YAW_STIFFNESS * yaw_error - _YAW_DAMPING * (r - r_d) - c[INV_JZ] * d[2]
     lift_part = 0.25 * specific / c[INV_MASS]
     shares = rotor_shares(alpha_x, alpha_y, alpha_z, c)
     for i in range(N_INPUT):
@@ -114,7 +134,7 @@ def _decide_rows(
     scratch: Array,
 ) -> int:
     """One decision per row; -1, or the code of the first argument that is not finite."""
-    stages = 2 if preview else 1
+    stages = min(windows.shape[1], TURNING_ROWS)
     bad = first_non_finite(plants, windows, lasts, disturbances, memories, stages)
     if bad >= 0:
         return bad
@@ -122,7 +142,8 @@ def _decide_rows(
     for j in range(plants.shape[0]):
         _wanted_acceleration(plants[j], windows[j], disturbances[j], gains, c, dt, preview, heading, u)
         psi_ref = math.atan2(windows[j, 0, 6], windows[j, 0, 7])
-        _rotor_forces(plants[j], u, psi_ref, disturbances[j], gains, c, heading, F)
+        psi_dot = turn_rate(windows[j], stages, 0, dt)
+        _rotor_forces(plants[j], u, psi_ref, psi_dot, disturbances[j], gains, c, heading, F)
         level = NONE
         if not math.isfinite(F[0] + F[1] + F[2] + F[3]):
             level = HOVER

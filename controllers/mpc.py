@@ -175,6 +175,7 @@ def mpc_data(task: BaseTask, horizon: int, options: MpcOptions) -> MpcData:
         gain=float(options.estimator_gain) if options.reject_disturbance else 0.0,
         heading=options.frame == "heading",
         attitude=options.frame == "heading" and options.velocity_reference == "attitude",
+        kinematics=False,
         iteration_limit=int(options.iteration_limit),
         plan_tilt=float(options.plan_tilt) if len(tilted.normals) else math.inf,
         own_outputs=len(own.normals),

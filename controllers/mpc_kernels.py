@@ -15,6 +15,7 @@ from quad_envs._numba import kernel
 from quad_envs.parameters import HOVER_FORCE, N_INPUT, N_STATE, Array
 from quad_envs.rotations import sincos, wrap_angle_scalar
 from quad_envs.tasks import BaseTask
+from quad_envs.turning import turn_rate
 
 from .disturbance import ESTIMATOR_SCRATCH, N_DISTURBANCE, feed_forward, remember, update_estimate
 from .fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXED_WEIGHT, limit_command
@@ -53,6 +54,7 @@ class MpcData(NamedTuple):
     gain: float  # of the disturbance estimator, 0 for none
     heading: bool  # whether the problem is posed at the present position and heading
     attitude: bool  # whether v_ref is turned into the present body axes
+    kinematics: bool  # whether the model turns body rates into Euler rates at the present attitude
     iteration_limit: int
     plan_tilt: float  # rad, of the plan's own rows, inf for none
     own_outputs: int  # outputs and rows of the task's limits, which stand first
@@ -194,23 +196,38 @@ def governed(x: float, y: float, z: float) -> float:
 
 
 @kernel
-def set_references(plant: Array, window: Array, trim: Array, heading: bool, attitude: bool, r: Array) -> None:
-    """Rows r_i = [p_ref; v_ref; trim phi, theta; psi_ref; 0] in the frame of the problem.
+def set_references(
+    plant: Array,
+    window: Array,
+    trim: Array,
+    heading: bool,
+    attitude: bool,
+    kinematics: bool,
+    stages: int,
+    dt: float,
+    r: Array,
+) -> None:
+    """Rows r_i = [p_ref; v_ref; trim phi, theta; psi_ref; Omega_ref] in the frame of the problem.
 
     The slot of V_B holds v_ref turned by the present heading, or by the whole present attitude, or (frame
     "hover", as in the dissertation) as it stands in inertial axes. psi_ref goes on continuously from row to
-    row; the first is the one nearest to psi with `heading`, and in (-pi, pi] without.
+    row; the first is the one nearest to psi with `heading`, and in (-pi, pi] without. Omega_ref is [0, 0,
+    psi_dot], or (`kinematics`) E(Theta) [0, 0, psi_dot] at the present attitude: what the model, at hover or
+    frozen, needs to turn with the heading.
 
     With `heading`, a window that begins farther than GOVERNOR_REACH from the vehicle is moved towards it as a
     whole; the dissertation's frame has no such governor.
 
     Args:
         plant: Measured, (16,).
-        window: (>= stages, 8).
+        window: (>= n, 8).
         trim: Attitude in equilibrium, (12,).
         heading: Whether the frame is turned and shifted to the vehicle.
         attitude: Whether v_ref is turned into the present body axes.
-        r: Result, (stages, 12).
+        kinematics: Whether Omega_ref is.
+        stages: Rows of the window that may be read, for psi_dot.
+        dt: Control period, s.
+        r: Result, (n, 12).
     """
     psi = plant[8]
     sine, cosine = sincos(psi if heading else 0.0)
@@ -220,6 +237,11 @@ def set_references(plant: Array, window: Array, trim: Array, heading: bool, atti
         sf, cf = sincos(plant[6])
         st, ct = sincos(plant[7])
         sv, cv = sincos(psi)
+    e9, e10, e11 = 0.0, 0.0, 1.0  # third column of E(Theta)
+    if kinematics:
+        roll_sine, roll_cosine = sincos(plant[6])
+        pitch_sine, pitch_cosine = sincos(plant[7])
+        e9, e10, e11 = -pitch_sine, roll_sine * pitch_cosine, roll_cosine * pitch_cosine
     yaw = 0.0
     for i in range(r.shape[0]):
         if i == 0:
@@ -244,7 +266,8 @@ def set_references(plant: Array, window: Array, trim: Array, heading: bool, atti
         r[i, 0], r[i, 1], r[i, 2] = cosine * x + sine * y, cosine * y - sine * x, z
         r[i, 3], r[i, 4], r[i, 5] = ct * u - st * w, sf * down + cf * v, cf * down - sf * v
         r[i, 6], r[i, 7], r[i, 8] = trim[6], trim[7], trim[8] + yaw
-        r[i, 9], r[i, 10], r[i, 11] = 0.0, 0.0, 0.0
+        psi_dot = turn_rate(window, stages, i, dt)
+        r[i, 9], r[i, 10], r[i, 11] = e9 * psi_dot, e10 * psi_dot, e11 * psi_dot
     if heading:
         x, y, z = r[0, 0], r[0, 1], r[0, 2]
         rest = 1.0 - governed(x, y, z)
@@ -315,7 +338,7 @@ def begin_row(
         s.d[3], s.d[4] = cosine * s.d[3] + sine * s.d[4], cosine * s.d[4] - sine * s.d[3]
     set_state(plant, data.heading, s.x_0)
     add_rotor_lag(plant, s.offset, data.B_c, data.lag, s.x_0)
-    set_references(plant, window, s.trim, data.heading, data.attitude, s.r)
+    set_references(plant, window, s.trim, data.heading, data.attitude, data.kinematics, N + 1, data.dt, s.r)
     for a in range(N_INPUT):
         s.lower[a] = -s.offset[a]
         s.upper[a] = data.force_max[a] - s.offset[a]

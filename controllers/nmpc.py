@@ -122,25 +122,42 @@ def velocity_residual(Theta: Array, v_ref: Array, D: Array) -> tuple[float, floa
 
 
 @kernel
+def rates_residual(Theta: Array, psi_dot: float, D: Array) -> tuple[float, float, float]:
+    """Omega_ref = E(Theta) [0, 0, psi_dot], and its derivative by Theta.
+
+    Args:
+        Theta: Roll, pitch, yaw, (3,).
+        psi_dot: Rate of the heading, rad/s.
+        D: Result, (3, 3).
+    """
+    sf, cf = sincos(Theta[0])
+    st, ct = sincos(Theta[1])
+    D[0, 0], D[1, 0], D[2, 0] = 0.0, psi_dot * cf * ct, -psi_dot * sf * ct
+    D[0, 1], D[1, 1], D[2, 1] = -psi_dot * ct, -psi_dot * sf * st, -psi_dot * cf * st
+    D[0, 2], D[1, 2], D[2, 2] = 0.0, 0.0, 0.0
+    return -psi_dot * st, psi_dot * sf * ct, psi_dot * cf * ct
+
+
+@kernel
 def gauss_newton_weight(Q: Array, D: Array, out: Array) -> None:
-    """E'Q E for E = I but for the block (V_B, Theta) = -D; the derivative of the residual.
+    """E'Q E for E = I but for the blocks (V_B, Theta) and (Omega, Theta) = -D; derivative of the residual.
 
     Args:
         Q: (12, 12), symmetric.
-        D: (3, 3).
+        D: (6, 3), or (3, 3) of V_B alone.
         out: Result, (12, 12).
     """
     n = N_STATE
     copy(Q, out)
     for i in range(n):
         for a in range(3):
-            for k in range(3):
-                out[i, 6 + a] -= Q[i, 3 + k] * D[k, a]
+            for k in range(D.shape[0]):
+                out[i, 6 + a] -= Q[i, 3 + k if k < 3 else 6 + k] * D[k, a]
     for a in range(3):
         for j in range(n):
             total = 0.0
-            for k in range(3):
-                total += D[k, a] * out[3 + k, j]
+            for k in range(D.shape[0]):
+                total += D[k, a] * out[3 + k if k < 3 else 6 + k, j]
             out[6 + a, j] -= total
 
 
@@ -148,11 +165,11 @@ def gauss_newton_weight(Q: Array, D: Array, out: Array) -> None:
 def linearise_cost(inertial: bool, data: MpcData, s: Scratch) -> None:
     """Stage weights Q_i = E_i'Q E_i and references X_i - E_i^-1 e(X_i) about the guess.
 
-    The residual is that of the reward, e = [p - p_ref; V_B - R_BI(Theta) v_ref; Theta - Theta_ref; Omega]
-    with the yaw error wrapped; without `inertial`, v_ref is not turned.
+    The residual is that of the reward, e = [p - p_ref; V_B - R_BI(Theta) v_ref; Theta - Theta_ref; Omega -
+    E(Theta) [0, 0, psi_dot] with the yaw error wrapped; without `inertial`, v_ref is not turned.
     """
     N = s.F.shape[0]
-    D = s.square[9, 2:5, :3]
+    D = s.square[9, 2:8, :3]
     fill(D, 0.0)
     for i in range(N + 1):
         r, X = s.target[i], s.X[i]
@@ -165,10 +182,18 @@ def linearise_cost(inertial: bool, data: MpcData, s: Scratch) -> None:
                 r[3 + k] = v[k]
                 for a in range(3):
                     r[3 + k] -= D[k, a] * (X[6 + a] - r[6 + a])
+        blocks = D[:3]
+        if s.r[i, 11] != 0.0:  # psi_dot: the heading turns
+            blocks = D
+            rates = rates_residual(X[6:9], s.r[i, 11], D[3:])
+            for k in range(3):
+                r[9 + k] = rates[k]
+                for a in range(3):
+                    r[9 + k] -= D[3 + k, a] * (X[6 + a] - r[6 + a])
         if i < N:
-            gauss_newton_weight(data.Q[0], D, s.Q[i])
+            gauss_newton_weight(data.Q[0], blocks, s.Q[i])
         else:
-            gauss_newton_weight(data.P, D, s.P)
+            gauss_newton_weight(data.P, blocks, s.P)
 
 
 @kernel

@@ -48,6 +48,30 @@ _TILT_LIMIT = 1.4  # rad, of roll and pitch of the states at which the model is 
 
 
 @kernel
+def hold_heading(r: Array, x: Array, A_c: Array, dt: float, c: Array) -> None:
+    """Add to c (12,) what keeps V_B from turning with the heading of the reference: Omega_ref x V_B.
+
+    The model turns V_B with the predicted rates, but moves the position by the V_B of the present axes, in
+    which v_ref stands, too: a vehicle that flies straight while its heading turns would seem to fly a curve.
+    Counting the planned turn out leaves V_B in axes that do not turn. Exact for alpha = 1.
+
+    Args:
+        r: Reference of the stage, (12,), with Omega_ref.
+        x: State at which the model was taken, (12,).
+        A_c: That model, (12, 12).
+        dt: Control period, s.
+        c: Affine term, (12,), changed in place.
+    """
+    p, q, w = r[9], r[10], r[11]
+    if p == 0.0 and q == 0.0 and w == 0.0:
+        return
+    g0, g1, g2 = q * x[5] - w * x[4], w * x[3] - p * x[5], p * x[4] - q * x[3]
+    c[3], c[4], c[5] = c[3] + dt * g0, c[4] + dt * g1, c[5] + dt * g2
+    for a in range(3):
+        c[a] += 0.5 * dt * dt * (A_c[a, 3] * g0 + A_c[a, 4] * g1 + A_c[a, 5] * g2)
+
+
+@kernel
 def freeze_model(alpha: float, sdre_weight: bool, data: MpcData, s: Scratch) -> bool:
     """The pair at x_0 for the whole horizon, and the terminal weight.
 
@@ -57,6 +81,8 @@ def freeze_model(alpha: float, sdre_weight: bool, data: MpcData, s: Scratch) -> 
     sdc_matrix(s.x_0, alpha, data.coefficients, s.A_c)
     zero_order_hold(s.A_c, data.B_c, data.dt, s.A[0], s.B[0], s.square)
     hold_trim(s.A[:1], s.trim, s.c)
+    for i in range(s.c.shape[0]):
+        hold_heading(s.r[i], s.x_0, s.A_c, data.dt, s.c[i])
     if sdre_weight and solve_dare(s.A[0], s.B[0], data.Q[0], data.R, s.P, s.square) > 0:
         return True
     copy(data.P, s.P)
@@ -69,9 +95,13 @@ def relinearise(u: Array, alpha: float, data: MpcData, s: Scratch) -> None:
     x, x_next = s.square[3, 0], s.square[3, 1]
     copy_vector(s.x_0, x)
     for i in range(u.shape[0]):
+        yaw = x[8]
+        x[8] -= s.r[i, 8] - s.r[0, 8]  # velocities do not turn with the heading of the reference
         sdc_matrix(x, alpha, data.coefficients, s.A_c)
+        x[8] = yaw
         zero_order_hold(s.A_c, data.B_c, data.dt, s.A[i], s.B[i], s.square)
         hold_trim(s.A[i : i + 1], s.trim, s.c[i : i + 1])
+        hold_heading(s.r[i], x, s.A_c, data.dt, s.c[i])
         for a in range(N_STATE):
             total = s.c[i, a]
             for b in range(N_STATE):
@@ -229,6 +259,7 @@ class SdcNmpc(Mpc):
                 "leave terminal out, or choose terminal_weight='hover'"
             )
         super().__init__(task, horizon, options, pairs=horizon if passes else 1, guess=False)
+        self._data = self._data._replace(kinematics=True)
         self.alpha = float(alpha)
         self.relinearisations, self._at_need = passes, relinearisations == "auto"
         self.terminal_weight = terminal_weight

@@ -12,7 +12,7 @@ from quad_envs._numba import kernel
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 from quad_envs.tasks import Task
 
-from .controller import FeedbackLaw, as_one_row, first_non_finite
+from .controller import TURNING_ROWS, FeedbackLaw, as_one_row, first_non_finite
 from .disturbance import feed_forward
 from .fallback import CLIPPED_SDRE, HOVER, NONE, limit_command
 from .linalg import copy
@@ -77,7 +77,8 @@ def _decide_rows(
     scratch: Array,
 ) -> int:
     """One decision per row; alpha < 0: the gain K_0 everywhere."""
-    bad = first_non_finite(plants, windows, lasts, disturbances, memories, 1)
+    stages = min(windows.shape[1], TURNING_ROWS)
+    bad = first_non_finite(plants, windows, lasts, disturbances, memories, stages)
     if bad >= 0:
         return bad
     rows = scratch[_MATRICES]
@@ -88,7 +89,7 @@ def _decide_rows(
         feed_forward(disturbances[j], plants[j, 8], c, force_max, offset, trim)
         set_state(plants[j], heading, x)
         add_rotor_lag(plants[j], offset, B_c, lag, x)
-        set_references(plants[j], windows[j], trim, heading, attitude, r)
+        set_references(plants[j], windows[j], trim, heading, attitude, alpha >= 0.0, stages, dt, r)
         level = NONE
         if alpha < 0.0 or not sdre_gain(x, alpha, c, B_c, Q, R, dt, K, scratch):
             level = NONE if alpha < 0.0 else CLIPPED_SDRE
@@ -107,6 +108,8 @@ def _decide_rows(
 
 class Sdre(FeedbackLaw):
     """du = -K(x) (x - r_0) with K(x) from the Riccati equation of the pair at x, clipped. No preview.
+
+    Of the rows that follow in the window only the rate of a turning heading is read, where there are any.
 
     `fallback` is CLIPPED_SDRE where the equation has no solution and the gain at hover is taken instead.
 
@@ -187,7 +190,8 @@ class Sdre(FeedbackLaw):
         feed_forward(revealed, plant_row[8], c, force_max, offset, trim)
         set_state(plant_row, heading, x)
         add_rotor_lag(plant_row, offset, B_c, lag, x)
-        set_references(plant_row, rows, trim, heading, attitude, r)
+        stages = min(len(rows), TURNING_ROWS)
+        set_references(plant_row, rows, trim, heading, attitude, alpha >= 0.0, stages, dt, r)
         params = self.task.params
         A, B = hover_pair(params, dt) if alpha < 0.0 else sdc_pair(x, params, dt, alpha)
         return OcpQp(

@@ -189,12 +189,9 @@ def encode_preview(
     out: NDArray[np.float32], start: int, reference: Array, row: int, stages: int, p: Array
 ) -> None:
     """Write reference rows row..row+stages-1 from out[start] on, positions relative to p."""
-    rows = reference[row : row + stages].reshape(-1)
-    target = out[start : start + N_REFERENCE * stages]
-    for i in range(N_REFERENCE * stages):  # one long loop, which vectorises
-        target[i] = rows[i]
+    target = out[start : start + N_REFERENCE * stages].reshape(stages, N_REFERENCE)
     for q in range(stages):
-        o = N_REFERENCE * q
-        target[o] = rows[o] - p[0]
-        target[o + 1] = rows[o + 1] - p[1]
-        target[o + 2] = rows[o + 2] - p[2]
+        for i in range(3):
+            target[q, i] = reference[row + q, i] - p[i]
+        for i in range(3, N_REFERENCE):
+            target[q, i] = reference[row + q, i]

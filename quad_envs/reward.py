@@ -3,8 +3,9 @@
     reward = (1 - v) / (1 + l),   l = |x - x_ref|_Q^2 + |u - u_T|_R^2,   v = min(1, sum_j hinge_j / scale_j)
 
 It is positive while the vehicle flies within its limits and a crash ends the episode, so that crashing early
-is never better than flying badly. x_ref = [p_ref; R_BI v_ref; 0, 0, psi_ref; 0]: the velocity error is the
-inertial one, seen in body axes; the yaw error is wrapped.
+is never better than flying badly. x_ref = [p_ref; R_BI v_ref; 0, 0, psi_ref; E(Theta) [0, 0, psi_dot]]: the
+velocity error is the inertial one, seen in body axes; the yaw error is wrapped; the wanted body rates are
+those of a heading that turns (`quad_envs.turning`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from numpy.typing import ArrayLike
 from ._numba import inline_kernel
 from .parameters import Array, Weights
 from .rotations import rotation_body_from_inertial, sincos, wrap_angle, wrap_angle_scalar
+from .turning import TURN_RATE, turning_rates
 
 
 @inline_kernel
@@ -25,7 +27,7 @@ def stage_cost_parts(
 
     Args:
         x: State, (>= 12,).
-        row: Reference row, (8,).
+        row: Row of a reference table, (9,): p_ref, v_ref, sin and cos of psi_ref, psi_dot.
         command: Rotor commands, (4,), N.
         hover: u_T, N.
         Q: Diagonal, (12,).
@@ -46,11 +48,12 @@ def stage_cost_parts(
     e8 = wrap_angle_scalar(x[8] - np.arctan2(row[6], row[7]))
     velocity = Q[3] * e3 * e3 + Q[4] * e4 * e4 + Q[5] * e5 * e5
     attitude = Q[6] * x[6] * x[6] + Q[7] * x[7] * x[7] + Q[8] * e8 * e8
-    position, rates, effort = 0.0, 0.0, 0.0
+    e9, e10, e11 = x[9] + st * row[8], x[10] - sf * ct * row[8], x[11] - cf * ct * row[8]
+    rates = Q[9] * e9 * e9 + Q[10] * e10 * e10 + Q[11] * e11 * e11
+    position, effort = 0.0, 0.0
     for i in range(3):
         e = x[i] - row[i]
         position += Q[i] * e * e
-        rates += Q[9 + i] * x[9 + i] * x[9 + i]
     for i in range(4):
         du = command[i] - hover
         effort += R[i] * du * du
@@ -69,7 +72,7 @@ def tracking_error(x: ArrayLike, rows: ArrayLike) -> Array:
 
     Args:
         x: States, (..., >= 12).
-        rows: Reference rows, (..., 8).
+        rows: Reference rows, (..., 9); psi_dot counts as 0 in rows of 8 numbers.
 
     Returns:
         (..., 12).
@@ -79,6 +82,8 @@ def tracking_error(x: ArrayLike, rows: ArrayLike) -> Array:
     error[..., 0:3] -= rows[..., 0:3]
     error[..., 3:6] -= np.einsum("...ij,...j->...i", rotation_body_from_inertial(x[..., 6:9]), rows[..., 3:6])
     error[..., 8] = wrap_angle(x[..., 8] - np.arctan2(rows[..., 6], rows[..., 7]))
+    if rows.shape[-1] > TURN_RATE:
+        error[..., 9:12] -= turning_rates(x[..., 6:9], rows[..., TURN_RATE])
     return error
 
 
@@ -87,7 +92,7 @@ def stage_cost(x: ArrayLike, rows: ArrayLike, command: ArrayLike, hover: float, 
 
     Args:
         x: States, (..., >= 12).
-        rows: Reference rows, (..., 8).
+        rows: Reference rows, (..., 9) or (..., 8), see `tracking_error`.
         command: Rotor commands, (..., 4), N.
         hover: u_T, N.
         weights: Q and R.

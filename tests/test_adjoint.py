@@ -9,6 +9,8 @@ from quad_envs.dynamics import simulate
 from quad_envs.envs.adjoint import action_slopes, reward_vjp, tracking_vjp_rows
 from quad_envs.envs.kernel import task_vector
 from quad_envs.parameters import QuadrotorParams
+from quad_envs.references import Heading, make_reference
+from quad_envs.turning import with_turn_rates
 
 STEP = 1e-6  # of the differences: their error is about 1e-9 for functions of order one
 LIMITS = {
@@ -69,7 +71,7 @@ def test_the_gradient_of_the_reward_is_its_derivative(limits):
     plants, commands, rng = random_plants(60)
     plants[:, :12] *= 0.7
     previous = commands + 0.8 * rng.normal(size=commands.shape)
-    references, work = 0.5 * rng.normal(size=(60, 8)), np.zeros(20)
+    references, work = 0.5 * rng.normal(size=(60, 9)), np.zeros(20)
     bar_x, bar_u, bar_p = np.zeros((60, 12)), np.zeros((60, 4)), np.zeros((60, 4))
 
     def rewards(x, u, p):
@@ -89,8 +91,10 @@ def test_the_gradient_of_the_reward_is_its_derivative(limits):
 
 
 def test_the_reward_of_the_adjoint_is_that_of_the_environment():
-    env = gym.make_vec("quad/CorridorTracking-v0", num_envs=40)
+    turning = Heading(make_reference("racetrack"), rate=0.6)
+    env = gym.make_vec("quad/CorridorTracking-v0", num_envs=40, reference=turning)
     env.reset(seed=0)
+    table = with_turn_rates(env.unwrapped.reference[0], env.unwrapped.task.dt)
     task, rng = task_vector(env.unwrapped.task, 5, 50.0), np.random.default_rng(0)
     scrap = np.zeros(12), np.zeros(4), np.zeros(4), np.zeros(20)
     previous = np.full((40, 4), env.unwrapped.task.hover_force)
@@ -98,8 +102,10 @@ def test_the_reward_of_the_adjoint_is_that_of_the_environment():
         _, rewards, terminated, _, _ = env.step(rng.uniform(-0.2, 0.2, (40, 4)).astype(np.float32))
         commands, plants = env.unwrapped._batch.rows[:, 16:20].copy(), env.unwrapped.state
         for j in np.flatnonzero(~terminated):
-            row = env.unwrapped.reference[j, k]
-            assert reward_vjp(plants[j], row, commands[j], previous[j], task, 0.0, 0.0, *scrap) == rewards[j]
+            assert (
+                reward_vjp(plants[j], table[k], commands[j], previous[j], task, 0.0, 0.0, *scrap)
+                == rewards[j]
+            )
         previous = commands
 
 
@@ -109,7 +115,7 @@ def test_the_adjoint_of_a_step_with_its_reward_is_the_derivative_of_both():
     force_max = env.unwrapped.task.force_max
     plants, commands, rng = random_plants(20)
     commands = np.clip(commands, 0.1, force_max - 0.1)
-    previous, references = commands + 0.2 * rng.normal(size=(20, 4)), rng.normal(size=(20, 8))
+    previous, references = commands + 0.2 * rng.normal(size=(20, 4)), rng.normal(size=(20, 9))
     bars, bar_rewards = rng.normal(size=(20, 16)), rng.normal(size=20)
     scrap = np.zeros(12), np.zeros(4), np.zeros(4), np.zeros(20)
 
@@ -131,7 +137,7 @@ def test_the_adjoint_of_a_step_with_its_reward_is_the_derivative_of_both():
 
 def test_the_gradient_of_the_cost_does_not_stop_where_the_reward_does():
     env = gym.make("quad/CorridorTracking-v0")
-    task, row = task_vector(env.unwrapped.task, 5, 50.0), np.zeros(8)
+    task, row = task_vector(env.unwrapped.task, 5, 50.0), np.zeros(9)
     x, command, work = np.zeros(16), np.full(4, 1.96), np.zeros(20)
     x[0] = 2.5  # half a metre outside, five times the scale
     for bar, bar_cost, expected in ((1.0, 0.0, 0.0), (0.0, 1.0, 10.0)):

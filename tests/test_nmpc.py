@@ -7,22 +7,33 @@ import pytest
 from flights import DT, HOVER, TASK, at_rest, decide_once, fly, helix, jumps, plan_of, window
 
 from controllers import ExactNmpc
-from controllers.nmpc import gauss_newton_weight, velocity_residual
+from controllers.nmpc import gauss_newton_weight, rates_residual, velocity_residual
 from controllers.riccati import dare
 from quad_envs.parameters import Limits
 from quad_envs.rotations import rotation_body_from_inertial
 from quad_envs.tasks import Task
+from quad_envs.turning import TURN_RATE, turning_rates, with_turn_rates
 
 N = 25
 STATE = np.r_[0.5, -0.4, 0.3, 1, 0.5, -0.5, 0.2, -0.3, 0.1, 0.5, 0.4, 0.1, np.full(4, HOVER)]
 SLOW = Task(limits=Limits(kappa=0.3125, rate=5.0))
 
 
-def residual(x, r):
+def residual(x, r, psi_dot=0.0):
     """That of the reward."""
     e = x - r
     e[3:6] = x[3:6] - rotation_body_from_inertial(x[6:9]) @ r[3:6]
+    e[9:12] = x[9:12] - turning_rates(x[6:9], psi_dot)
     return e
+
+
+def turning_window(horizon, psi=0.3, rate=0.0):
+    """Rows beside the state of these tests, with a heading that turns."""
+    rows = window(helix, 40, horizon)
+    rows[:, :3] -= rows[0, :3] - [0.2, 0.1, -0.2]
+    headings = psi + rate * DT * np.arange(horizon + 1)
+    rows[:, 6], rows[:, 7] = np.sin(headings), np.cos(headings)
+    return rows
 
 
 def test_velocity_residual_is_rotation_and_its_derivative():
@@ -40,12 +51,32 @@ def test_velocity_residual_is_rotation_and_its_derivative():
         np.testing.assert_allclose(D, np.transpose(differences), atol=1e-9)
 
 
-def test_gauss_newton_weight_is_that_of_the_residuals_derivative():
+def test_wanted_rates_are_those_of_the_reward_and_their_derivative():
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        Theta, psi_dot, D = rng.uniform(-1.4, 1.4, 3), rng.normal(), np.empty((3, 3))
+        np.testing.assert_allclose(
+            rates_residual(Theta, psi_dot, D), turning_rates(Theta, psi_dot), atol=1e-14
+        )
+        step = 1e-6
+        differences = [
+            (turning_rates(Theta + e, psi_dot) - turning_rates(Theta - e, psi_dot)) / (2 * step)
+            for e in step * np.eye(3)
+        ]
+        np.testing.assert_allclose(D, np.transpose(differences), atol=1e-9)
+
+
+@pytest.mark.parametrize("psi_dot", [0.0, 0.8])
+def test_gauss_newton_weight_is_that_of_the_residuals_derivative(psi_dot):
     rng = np.random.default_rng(1)
     x, r, step = rng.normal(size=12), rng.normal(size=12), 1e-6
-    E = np.stack([(residual(x + e, r) - residual(x - e, r)) / (2 * step) for e in step * np.eye(12)], axis=-1)
-    D, out, root = np.empty((3, 3)), np.empty((12, 12)), rng.normal(size=(12, 12))
-    velocity_residual(x[6:9], r[3:6], D)
+    differences = [
+        (residual(x + e, r, psi_dot) - residual(x - e, r, psi_dot)) / (2 * step) for e in step * np.eye(12)
+    ]
+    E = np.stack(differences, axis=-1)
+    D, out, root = np.empty((6, 3)), np.empty((12, 12)), rng.normal(size=(12, 12))
+    velocity_residual(x[6:9], r[3:6], D[:3])
+    rates_residual(x[6:9], psi_dot, D[3:])
     Q = root @ root.T
     gauss_newton_weight(Q, D, out)
     np.testing.assert_allclose(out, E.T @ Q @ E, atol=1e-7)
@@ -54,8 +85,7 @@ def test_gauss_newton_weight_is_that_of_the_residuals_derivative():
 @pytest.mark.parametrize("velocity_error", ["inertial", "body"])
 def test_real_time_iteration_stays_at_the_converged_solution(velocity_error):
     """Fed with its own solution at the same state, one pass moves by less than SQP's tolerance."""
-    rows = window(helix, 40, N)
-    rows[:, :3] -= rows[0, :3] - [0.2, 0.1, -0.2]
+    rows = turning_window(N, psi=0.0)
     converged = decide_once(ExactNmpc(SLOW, passes=60, velocity_error=velocity_error), STATE, rows)
     memory = converged.memory[0].copy()
     plan, X = memory[1 : 1 + 4 * N].reshape(N, 4), memory[2 + 5 * N :].reshape(N + 1, 12)
@@ -138,7 +168,9 @@ def ipopt_plan(x_0, rows, last, task, horizon, velocity_error, terminal):
     def error(x, row):
         r = ca.DM([*row[:3], *row[3:6], 0, 0, np.arctan2(row[6], row[7]), 0, 0, 0])
         v = rotation(x[6:9]) @ r[3:6] if velocity_error == "inertial" else r[3:6]
-        return ca.vertcat(x[:3] - r[:3], x[3:6] - v, x[6:9] - r[6:9], x[9:12])
+        # The heading turns about the inertial z axis, seen in body axes.
+        Omega_ref = rotation(x[6:9]) @ ca.DM([0, 0, row[TURN_RATE]])
+        return ca.vertcat(x[:3] - r[:3], x[3:6] - v, x[6:9] - r[6:9], x[9:12] - Omega_ref)
 
     u = ca.SX.sym("u", 4, horizon)
     x, cost, before, moves = ca.DM(x_0), 0, ca.DM(last - HOVER), []
@@ -165,16 +197,16 @@ def ipopt_plan(x_0, rows, last, task, horizon, velocity_error, terminal):
 @pytest.mark.slow
 @pytest.mark.parametrize("velocity_error", ["inertial", "body"])
 @pytest.mark.parametrize("limits", [Limits(), Limits(kappa=0.3125, rate=5.0)], ids=["free", "tight"])
-def test_converged_plan_is_that_of_ipopt(velocity_error, limits):
+@pytest.mark.parametrize("rate", [0.0, 0.8])
+def test_converged_plan_is_that_of_ipopt(velocity_error, limits, rate):
     """Gauss-Newton and IPOPT stop at 1e-6 N each."""
     from controllers import hover_pair
 
     task, horizon = Task(limits=limits), 15
-    rows = window(helix, 40, horizon, psi=0.3)
-    rows[:, :3] -= rows[0, :3] - [0.2, 0.1, -0.2]
+    rows = turning_window(horizon, rate=rate)
     P = dare(*hover_pair(task.params, DT), np.eye(12), np.eye(4))
     last = np.full(4, HOVER)
     controller = ExactNmpc(task, horizon, passes=100, velocity_error=velocity_error, frame="hover")
     plan = plan_of(decide_once(controller, STATE, rows, last), horizon)
-    expected = ipopt_plan(STATE[:12], rows, last, task, horizon, velocity_error, P)
+    expected = ipopt_plan(STATE[:12], with_turn_rates(rows, DT), last, task, horizon, velocity_error, P)
     np.testing.assert_allclose(plan, expected, atol=1e-5)

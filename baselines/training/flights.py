@@ -26,6 +26,7 @@ from quad_envs.envs.kernel import (
     task_vector,
 )
 from quad_envs.envs.options import TrackingOptions
+from quad_envs.observations import N_REFERENCE
 from quad_envs.parameters import Array
 
 from .networks import Features, default_features, preview_stages
@@ -42,7 +43,7 @@ class Record(NamedTuple):
     commands: Array  # (n, 4), N
     previous: Array  # (n, 4), N, commands of the step before
     after: Array  # (n, 16), afterwards, before any reset
-    references: Array  # (n, 8), of the time afterwards
+    references: Array  # (n, 9), of the time afterwards
     crashed: Bools  # (n,)
     force_max: Array  # (n, 4), N
     coefficients: Array  # (n, N_COEFFICIENTS)
@@ -87,6 +88,7 @@ class DifferentiableFlights:
         p, psi = rows[:, None, :3], rows[:, 8:9]
         steps = rows[:, STEP].astype(np.int64)[:, None] + self._stages
         preview = references[self.batch.which[0][:, None], np.minimum(steps, references.shape[1] - 1)]
+        preview = preview[:, :, :N_REFERENCE]
         preview[:, :, :3] -= p
         parts = [rows[:, 3:8], np.sin(psi), np.cos(psi), rows[:, 9:20]]
         if self.task.layout.position:

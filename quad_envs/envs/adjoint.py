@@ -46,13 +46,18 @@ def _stage_cost_vjp(
     e5 = Q[5] * (x[5] - (cf * down - sf * right))
     for i in range(3):
         bar_x[i] = 2.0 * Q[i] * (x[i] - row[i])
-        bar_x[9 + i] = 2.0 * Q[9 + i] * x[9 + i]
     bar_x[3], bar_x[4], bar_x[5] = 2.0 * e3, 2.0 * e4, 2.0 * e5
     # The reference velocity in body axes turns with the attitude.
     bar_x[6] = 2.0 * (Q[6] * x[6] - e4 * (cf * down - sf * right) + e5 * (sf * down + cf * right))
     slope = ct * forward - st * vz  # of `down` with the pitch
     bar_x[7] = 2.0 * (Q[7] * x[7] + e3 * down - (e4 * sf + e5 * cf) * slope)
     turn = -e3 * ct * right - e4 * (sf * st * right - cf * forward) - e5 * (cf * st * right + sf * forward)
+    # So do the body rates of a heading that turns.
+    e9 = Q[9] * (x[9] + st * row[8])
+    e10, e11 = Q[10] * (x[10] - sf * ct * row[8]), Q[11] * (x[11] - cf * ct * row[8])
+    bar_x[9], bar_x[10], bar_x[11] = 2.0 * e9, 2.0 * e10, 2.0 * e11
+    bar_x[6] += 2.0 * row[8] * ct * (e11 * sf - e10 * cf)
+    bar_x[7] += 2.0 * row[8] * (e9 * ct + st * (e10 * sf + e11 * cf))
     bar_x[8] = 2.0 * (Q[8] * wrap_angle_scalar(x[8] - np.arctan2(row[6], row[7])) + turn)
     for i in range(4):
         bar_command[i] = 2.0 * R[i] * (command[i] - hover)
@@ -133,7 +138,7 @@ def reward_vjp(
 
     Args:
         x: State after the step, (>= 12,).
-        reference: Row of the time after the step, (8,).
+        reference: Row of the time after the step, (9,).
         command: Rotor commands of the step, (4,), N.
         previous: Of the step before, (4,), N.
         task: Task vector of `kernel`.
@@ -188,7 +193,7 @@ def tracking_vjp_rows(
         commands: (n, 4), N.
         previous: Commands of the step before, (n, 4), N.
         after: Plants after the step, (n, 16).
-        references: Rows of the time after the step, (n, 8).
+        references: Rows of the time after the step, (n, 9).
         crashed: (n,), flights that ended in a crash: their reward is 0 and leads nowhere.
         force_max: Rotor saturation of each, (n, 4), N.
         coefficients: Of each, (n, N_COEFFICIENTS).

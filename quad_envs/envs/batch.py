@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from .._numba import entry_of
 from ..disturbances import Disturbance
-from ..observations import N_REFERENCE
 from ..parameters import N_STATE, POSITION, Array
 from ..references import Reference, make_reference, state_on
+from ..turning import N_TABLE
 from .given import given_plants
 from .kernel import (
     COEFFICIENTS,
@@ -58,7 +58,7 @@ class TrackingBatch:
             bool(self._noise.any()),
         )
         count = [n if is_random else 1 for is_random in random]
-        self.references: Array = np.zeros((count[0], self._times.size, N_REFERENCE))
+        self.references: Array = np.zeros((count[0], self._times.size, N_TABLE))
         self.disturbances: Array = np.zeros(
             (count[1], steps if self._disturbance else 0, self._nodes.shape[1], 6)
         )
@@ -138,7 +138,7 @@ class TrackingBatch:
         )
 
     def reference(self, i: int) -> Array:
-        """Reference rows of flight i in its present episode, a view, (n_steps, 8)."""
+        """Reference rows of flight i in its present episode, a view, (n_steps, 9)."""
         return np.asarray(self.references[self.which[0, i]])
 
     def step(self, actions: NDArray[np.floating], out: NDArray[np.float32]) -> None:

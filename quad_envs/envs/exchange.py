@@ -72,7 +72,7 @@ class Tables(NamedTuple):
     schedule: IntArray  # (T+1,), graph of each step
     offsets: Array  # (N, K + 1, 3), delta_ij per slot, then p_i* relative to the leader or the target, m
     which: IntArray  # (5, n), table that a row reads: reference, disturbance, noise, target, draw
-    references: Array  # (n_tables, n_steps, 8), of the leader
+    references: Array  # (n_tables, n_steps, 9), of the leader
     disturbances: Array  # (n_tables, n_steps, n_nodes, 6)
     noises: Array  # (n_tables, n_steps, 12), of the vehicles' own state; no steps for none
     targets: Array  # (n_tables, n_steps, 6), r and v of the target; no steps for none
@@ -292,7 +292,7 @@ def observe_agent(
         messages: What it heard, (K, HEAD + C).
         motions: True motions of the team, (N, 10).
         offsets: delta_ij per slot, then its slot, (K + 1, 3).
-        reference: The leader's, (n_steps, 8).
+        reference: The leader's, (n_steps, 9).
         disturbance: Its own, (n_steps, n_nodes, 6).
         sensed: How many vehicles it senses.
         which: Those, (K_s,).

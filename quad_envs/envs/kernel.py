@@ -190,7 +190,7 @@ def observe(
 
     Args:
         row: The vehicle.
-        reference: Its reference table, (n_steps, 8).
+        reference: Its reference table, (n_steps, 9).
         disturbance: Its disturbance table, (n_steps, n_nodes, 6).
         noise: Its measurement errors, (n_steps, 12); no steps for none.
         task: Task vector.
@@ -231,7 +231,7 @@ def step_rows(
 
     Args:
         rows: (n, ROW_SIZE), modified in place.
-        references: Tables (n_tables, n_steps, 8).
+        references: Tables (n_tables, n_steps, 9).
         disturbances: Tables (n_tables, n_steps, 2 substeps + 1, 6); no steps for none.
         noises: Tables (n_tables, n_steps, 12); no steps for none.
         which: Reference, disturbance and noise table of each row, (3, n) int64.

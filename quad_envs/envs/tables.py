@@ -17,10 +17,11 @@ from ..observations import N_REFERENCE
 from ..parameters import Array
 from ..references import Reference, too_fast
 from ..tasks import BaseTask
+from ..turning import with_turn_rates
 
 
 def reference_rows(reference: Reference, times: Array, rng: np.random.Generator) -> Array:
-    """Reference rows at times (n,), (n, 8).
+    """Reference rows at the control samples (n,) >= 2, with the rate of the heading, (n, 9).
 
     Raises:
         ValueError: If the reference gives another shape or a number that is not finite, or is too fast.
@@ -29,7 +30,7 @@ def reference_rows(reference: Reference, times: Array, rng: np.random.Generator)
     said = too_fast(rows[:, 3:6], times)
     if said:
         raise ValueError(f"reference {shown(reference)} {said}")
-    return rows
+    return with_turn_rates(rows, float(times[1] - times[0]))
 
 
 def checked_rows(kind: str, source: object, rows: Any, times: Array, width: int) -> Array:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from ..graphs import GraphTable
+from ..observations import N_REFERENCE
 from ..parameters import Array
 from ..tasks import TeamTask
 from .exchange import ALIVE, HEARD, NEAREST, SLOT_ERROR, TERMINATED, TERMS
@@ -134,7 +135,8 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
         """
         batch, k = self._batch, int(self._batch.rows[0, STEP])
         stages = self.task.layout.preview + 1
-        preview = batch.references[0, k : k + stages] if batch.options.has_leader else np.zeros((stages, 8))
+        rows = batch.references[0, k : k + stages, :N_REFERENCE]
+        preview = rows if batch.options.has_leader else np.zeros((stages, N_REFERENCE))
         alive = batch.rows[:, ALIVE]
         graph = batch.graph(k) * alive * alive[:, None]
         parts = (self.plants, batch.target(0)[k], graph, preview, k / self.task.episode_steps)

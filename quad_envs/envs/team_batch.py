@@ -20,6 +20,7 @@ from ..parameters import N_STATE, Array
 from ..references import make_reference, pack_rows
 from ..sensors import sensor_rows
 from ..targets import N_TARGET, make_target
+from ..turning import N_TABLE
 from .exchange import DISTURBANCE, DRAW, HEAD, MEASURES, NOISE, PLAN, REFERENCE, TARGET, TEAM_ROW_SIZE
 from .given import given_plants
 from .kernel import COEFFICIENTS, COMMAND, FORCE_MAX, PLANT, task_vector
@@ -88,7 +89,7 @@ class TeamBatch:
         units = (teams, teams * n, teams * n, teams, teams)
         count = [unit if random else 1 for unit, random in zip(units, self._random, strict=True)]
         width = 4 + self.task.layout.neighbours
-        self.references: Array = np.zeros((count[REFERENCE], self._times.size, N_REFERENCE))
+        self.references: Array = np.zeros((count[REFERENCE], self._times.size, N_TABLE))
         n_periods = steps if self._disturbance else 0
         self.disturbances: Array = np.zeros((count[DISTURBANCE], n_periods, self._nodes.shape[1], 6))
         self.noises: Array = np.zeros((count[NOISE], steps + 1 if noisy else 0, N_STATE))
@@ -179,7 +180,7 @@ class TeamBatch:
         """Where each vehicle of team t should be, rows as in a reference, (N, T+1, 8)."""
         steps = self.task.episode_steps + 1
         if self._target is None:
-            rows = self.references[self._which[REFERENCE, t * self.n], :steps]
+            rows = self.references[self._which[REFERENCE, t * self.n], :steps, :N_REFERENCE]
         else:
             rows = pack_rows(*np.split(self.target(t), 2, axis=1))
         out = np.repeat(rows[None], self.n, axis=0)

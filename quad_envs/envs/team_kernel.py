@@ -15,6 +15,7 @@ from .._numba import Int, inline_kernel, kernel
 from ..agent_observations import N_PLAN_STAGE
 from ..dynamics import LANES, SCRATCH_ROWS, advance, load_vehicle, store_vehicle
 from ..parameters import Array
+from ..turning import N_TABLE
 from .exchange import (
     ALIVE,
     DISTURBANCE,
@@ -65,7 +66,7 @@ def scratch_size(vehicles: int, sensed: int) -> int:
     """Numbers that `step_teams` and `begin_team` need as scratch."""
     room = max(vehicles, LANES)
     integrator = -(-room // LANES) * SCRATCH_ROWS * LANES
-    return 8 * room + 8 + max(integrator, (16 + 2 * N_MOTION) * vehicles + 2 * sensed)
+    return 8 * room + N_TABLE + max(integrator, (16 + 2 * N_MOTION) * vehicles + 2 * sensed)
 
 
 @kernel
@@ -287,8 +288,8 @@ def step_teams(
     room = max(n, LANES)
     previous = scratch[: 4 * room].reshape(room, 4)
     places = scratch[4 * room : 8 * room].reshape(4, room)
-    wanted = scratch[8 * room : 8 * room + 8]
-    rest = scratch[8 * room + 8 :]
+    wanted = scratch[8 * room : 8 * room + N_TABLE]
+    rest = scratch[8 * room + N_TABLE :]
     on_rails = team[ON_RAILS] > 0.0
     group = max(1, LANES // n) * n  # rows of as many teams as fit into a block of lanes
     for first in range(0, rows_in_all, group):
@@ -347,8 +348,8 @@ def begin_team(
     )
     n = neighbours.shape[0]
     room = max(n, LANES)
-    places, wanted = scratch[4 * room : 8 * room].reshape(4, room), scratch[8 * room : 8 * room + 8]
-    rest = scratch[8 * room + 8 :]
+    places, wanted = scratch[4 * room : 8 * room].reshape(4, room), scratch[8 * room : 8 * room + N_TABLE]
+    rest = scratch[8 * room + N_TABLE :]
     past = history[begin // n]
     for i in range(n):
         row = rows[begin + i]

@@ -9,6 +9,7 @@ from ..constraints import TOLERANCE
 from ..parameters import Array
 from ..reward import stage_cost_parts
 from ..tasks import CRASH_CAUSES, LOSS_PARTS
+from ..turning import N_TABLE
 from .exchange import (
     ALIVE,
     ARENA,
@@ -61,7 +62,7 @@ def _judge_flight(
 
     Args:
         row: The vehicle.
-        wanted: Its slot at the new time: p*, v*, sin and cos of psi_ref, (8,).
+        wanted: Its slot at the new time: p*, v*, sin and cos of psi_ref, psi_dot, (9,).
         previous: Its rotor commands of the step before, (4,).
         formation: Mean squared error to its neighbours, m^2.
         task: Task vector.
@@ -128,16 +129,16 @@ def _formation_error(k: int, i: int, rows: Array, first: int, tables: Tables) ->
 
 @inline_kernel
 def _want(k: int, i: int, first: int, tables: Tables, team: Array, out: Array) -> None:
-    """Where vehicle i should be: its slot beside the leader's reference, or beside the target; (8,)."""
+    """Where vehicle i should be: its slot beside the leader's reference, or beside the target; (9,)."""
     if team[HAS_LEADER] > 0.0:
         reference = tables.references[tables.which[REFERENCE, first]]
-        for c in range(8):
+        for c in range(N_TABLE):
             out[c] = reference[min(k, reference.shape[0] - 1), c]
     else:
         target = tables.targets[tables.which[TARGET, first]]
         for c in range(6):
             out[c] = target[min(k, target.shape[0] - 1), c]
-        out[6], out[7] = 0.0, 1.0
+        out[6], out[7], out[8] = 0.0, 1.0, 0.0
     for c in range(3):
         out[c] += tables.offsets[i, tables.offsets.shape[1] - 1, c]
 

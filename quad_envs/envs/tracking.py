@@ -10,6 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ..episode_limit import steps_asked
+from ..observations import N_REFERENCE
 from ..parameters import Array
 from ..tasks import Task
 from .batch import TrackingBatch
@@ -131,7 +132,7 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
     @property
     def reference(self) -> Array:
         """Copy of this episode's reference rows from the start on, (n_steps, 8). For study and tests."""
-        return np.array(self._batch.references[0])
+        return np.array(self._batch.references[0, :, :N_REFERENCE])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

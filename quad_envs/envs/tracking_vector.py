@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from ..observations import N_REFERENCE
 from ..parameters import Array
 from ..tasks import Task
 from .batch import TrackingBatch
@@ -87,7 +88,7 @@ class TrackingVectorEnv(
     @property
     def reference(self) -> Array:
         """Copy of the reference rows of the present episodes, (n, n_steps, 8). For study and tests."""
-        tables = self._batch.references
+        tables = self._batch.references[:, :, :N_REFERENCE]
         return np.repeat(tables, self.num_envs, axis=0) if len(tables) == 1 else tables.copy()
 
     def reset(

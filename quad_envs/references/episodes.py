@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..parameters import Array
+from ..turning import TURN_RATE
 
 _NEAR = 0.02  # of the episode, by which a table may end earlier or later without a word
 _INSIDE = ("reference", "path")  # fields in which a reference or target holds another
@@ -79,12 +80,12 @@ def mismatch(reference: Any, dt: float, time_limit: float) -> str:
 
 
 def state_on(row: Array) -> Array:
-    """State (12,) of a vehicle that flies level on a reference row: position, velocity, heading."""
+    """State (12,) of a vehicle that flies level on a row of a table, and turns with its heading."""
     x = np.zeros(12)
     sin, cos = row[6], row[7]
     x[:3] = row[:3]
     x[3:6] = cos * row[3] + sin * row[4], cos * row[4] - sin * row[3], row[5]
-    x[8] = math.atan2(sin, cos)
+    x[8], x[11] = math.atan2(sin, cos), row[TURN_RATE]
     return x
 
 

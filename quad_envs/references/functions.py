@@ -13,6 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..names import shown
 from ..parameters import Array
+from ..rotations import wrap_angle
+from ..turning import LARGEST_TURN
 from .plausible import contradiction
 from .trajectories import Reference, pack_rows
 
@@ -27,7 +29,8 @@ _WANTED = "a reference function must return 3 (p), 4 (p, psi), 6 (p, v) or 7 (p,
 class FunctionReference:
     """A function t -> position, optionally velocity and heading; `from_function` documents it.
 
-    Between 0 and `end` the function is asked; after it the trajectory goes on with its last velocity.
+    Between 0 and `end` the function is asked; after it the trajectory goes on with its last velocity,
+    and the heading with its last rate.
     """
 
     function: Callable[[float], ArrayLike]
@@ -51,8 +54,16 @@ class FunctionReference:
         else:
             v = self._slopes(asked, values[:, :3])
         psi = values[:, {4: 3, 7: 6}[width]] if width in (4, 7) else np.zeros(asked.size)
-        p = values[which, :3] + (t - asked[which])[:, None] * v[which]
-        return pack_rows(p, v[which], psi[which])
+        beyond = t - asked[which]
+        p = values[which, :3] + beyond[:, None] * v[which]
+        return pack_rows(p, v[which], psi[which] + beyond * self._last_turn(asked, psi))
+
+    def _last_turn(self, t: Array, psi: Array) -> float:
+        """Rate at which the heading goes on after the episode, rad/s: its last one, 0 after a jump."""
+        if t.size < 2:
+            return 0.0
+        rate = float(wrap_angle(psi[-1] - psi[-2]) / (t[-1] - t[-2]))
+        return rate if abs(rate) <= LARGEST_TURN else 0.0
 
     def _slopes(self, t: Array, p: Array) -> Array:
         """Derivatives of the positions p (n, 3) at times t (n,): of the smooth side where there is a jump."""
@@ -110,8 +121,8 @@ def from_function(function: Callable[[float], ArrayLike]) -> Reference:
     Args:
         function: t in s -> 3 (p), 4 (p, psi), 6 (p, v) or 7 (p, v, psi) numbers, SI, NED. It is sampled when
             an environment is made, at the control period, from 0 to the time limit and never beyond; the
-            preview goes on with the last velocity. Without v it is also called a millisecond before and
-            after; where it jumps, the velocity is that of the smooth side.
+            preview goes on with the last velocity and rate of the heading. Without v it is also called a
+            millisecond before and after; where it jumps, the velocity is that of the smooth side.
 
     Returns:
         A reference for `gym.make(..., reference=...)`. It pickles if the function does.

@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike
 from ..observations import N_REFERENCE
 from ..parameters import Array
 
+_RESTING_SPEED = 0.05  # m/s
+
 
 @runtime_checkable
 class Reference(Protocol):
@@ -199,7 +201,12 @@ class RandomSmooth:
 
 @dataclass(frozen=True, slots=True)
 class Heading:
-    """Another trajectory with a heading of its own: psi = yaw + rate t, or along the path where `tangent`."""
+    """Another trajectory with a heading of its own: psi = yaw + rate t, or along the path where `tangent`.
+
+    Where the path rests (below 0.05 m/s in the horizontal plane) it has no direction: a tangent heading stays
+    as it was, and before the path sets out it is that of its first movement. A heading that turns by more
+    than 2 pi rad/s jumps: controllers and reward take its rate for 0.
+    """
 
     reference: Reference
     yaw: float = 0.0  # rad
@@ -216,5 +223,14 @@ class Heading:
         rows = self.reference.rows(t, rng)
         psi = self.yaw + self.rate * t
         if self.tangent:
-            psi = psi + np.arctan2(rows[:, 4], rows[:, 3])
+            psi = psi + _path_direction(rows[:, 3:5])
         return pack_rows(rows[:, :3], rows[:, 3:6], psi)
+
+
+def _path_direction(v: Array) -> Array:
+    """Direction of horizontal velocities (n, 2) in order of time, unwrapped; kept in rests, (n,)."""
+    moves = np.hypot(v[:, 0], v[:, 1]) >= _RESTING_SPEED
+    if not moves.any():
+        return np.zeros(len(v))
+    last = np.maximum.accumulate(np.where(moves, np.arange(len(v)), int(np.argmax(moves))))
+    return np.unwrap(np.arctan2(v[:, 1], v[:, 0])[last])
