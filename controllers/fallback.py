@@ -41,3 +41,30 @@ def limit_command(F: Array, last: Array, rate_step: float, force_max: Array, out
         value = F[a] if abs(F[a]) < 1e300 else last[a]
         value = min(max(value, last[a] - rate_step), last[a] + rate_step)
         out[a] = min(max(value, 0.0), force_max[a])
+
+
+@kernel
+def yield_yaw(F: Array, last: Array, rate_step: float, force_max: Array) -> None:
+    """Take back the yaw torque for which the rotors have no room beside thrust, roll and pitch; in place.
+
+    Clipped rotor by rotor, a large yaw error would cost the roll and pitch that keep a vehicle in the air. A
+    wish within the box stays as it is.
+
+    Args:
+        F: Wanted rotor commands, (4,), N.
+        last: Last applied commands, (4,), N.
+        rate_step: Largest change, N; inf for none.
+        force_max: Upper face of the box, (4,), N.
+    """
+    yaw = 0.25 * (F[1] + F[3] - F[0] - F[2])  # the mixer's row of the yaw torque
+    share = 1.0
+    for a in range(N_INPUT):
+        part = yaw if a % 2 == 1 else -yaw
+        rest = F[a] - part
+        low, high = max(0.0, last[a] - rate_step), min(force_max[a], last[a] + rate_step)
+        room = max(high - rest if part > 0.0 else rest - low, 0.0)
+        if abs(part) > room:
+            share = min(share, room / abs(part))
+    if share < 1.0:
+        for a in range(N_INPUT):
+            F[a] -= (1.0 - share) * (yaw if a % 2 == 1 else -yaw)

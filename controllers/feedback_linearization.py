@@ -26,7 +26,7 @@ from quad_envs.tasks import Task
 from quad_envs.turning import turn_rate
 
 from .controller import TURNING_ROWS, FeedbackLaw, first_non_finite
-from .fallback import HOVER, NONE, limit_command
+from .fallback import HOVER, NONE, limit_command, yield_yaw
 from .mpc import Frame, require_choice
 from .mpc_kernels import governed
 from .ocp import IntArray
@@ -148,6 +148,8 @@ def _decide_rows(
         if not math.isfinite(F[0] + F[1] + F[2] + F[3]):
             level = HOVER
             F[:] = 0.25 * c[GRAVITY] / c[INV_MASS]
+        if heading:
+            yield_yaw(F, lasts[j], rate_step, force_max)
         limit_command(F, lasts[j], rate_step, force_max, commands[j])
         report[0, j], report[1, j] = level, 0
     return bad

@@ -14,7 +14,7 @@ from quad_envs.tasks import Task
 
 from .controller import TURNING_ROWS, FeedbackLaw, as_one_row, first_non_finite
 from .disturbance import feed_forward
-from .fallback import CLIPPED_SDRE, HOVER, NONE, limit_command
+from .fallback import CLIPPED_SDRE, HOVER, NONE, limit_command, yield_yaw
 from .linalg import copy
 from .model import hover_pair, sdc_matrix, sdc_pair, zero_order_hold
 from .mpc import Frame, VelocityReference, require_choice
@@ -101,6 +101,8 @@ def _decide_rows(
         if not math.isfinite(F[0] + F[1] + F[2] + F[3]):
             level = HOVER
             copy_vector(offset, F)
+        if heading:
+            yield_yaw(F, lasts[j], rate_step, force_max)
         limit_command(F, lasts[j], rate_step, force_max, commands[j])
         report[0, j], report[1, j] = level, 0
     return bad
