@@ -30,7 +30,7 @@ def test_a_far_window_is_moved_as_a_whole_and_a_near_one_is_left_alone(heading):
         window[:, 0] += [0.0, 0.1, 0.2, 0.4]
         window[:, 7] = 1.0
         r = np.empty((4, 12))
-        set_references(plant, window, np.zeros(12), heading, False, r)
+        set_references(plant, window, np.zeros(12), heading, False, False, 4, 0.05, r)
         own = np.zeros(3) if heading else plant[:3]
         wanted = min(distance, GOVERNOR_REACH) if heading else distance
         assert np.linalg.norm(r[0, :3] - own) == pytest.approx(wanted, abs=1e-12)
