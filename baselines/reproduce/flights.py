@@ -40,7 +40,7 @@ CONTROLLERS: dict[str, tuple[str, dict[str, Any]]] = {
     "1 pass, alpha 1": ("sdc-nmpc", {**_DISSERTATION, "alpha": 1.0, "relinearisations": 1}),
     "RTI": ("nmpc", {**_DISSERTATION, "velocity_error": "body"}),
     "exact": ("nmpc", {**_DISSERTATION, "velocity_error": "body", "passes": 30}),
-    "FBL": ("feedback-linearization", {}),
+    "FBL": ("feedback-linearization", _DISSERTATION),
 }
 
 
