@@ -10,7 +10,6 @@ import numpy as np
 from controllers.collision import AvoidanceRule, AvoidanceSet
 from controllers.consensus import Neighbour, TargetModel
 from controllers.cooperative_mpc import CooperativeDecision, CooperativeMpc, CooperativeTerminalWeight
-from controllers.disturbance import ESTIMATOR_GAIN
 from controllers.solvers.structured import ITERATION_LIMIT
 from quad_envs.agent_observations import N_SENSED
 from quad_envs.names import unknown_name
@@ -167,7 +166,7 @@ class ConsensusMpc(CooperativePolicy):
         soft_weight: float = 1e3,
         margin: float = 0.02,
         reject_disturbance: bool = False,
-        estimator_gain: float = ESTIMATOR_GAIN,
+        estimator_gain: float | Literal["auto"] = "auto",
         iteration_limit: int = ITERATION_LIMIT,
     ) -> None:
         if task.layout.target:
@@ -242,7 +241,7 @@ def make_cooperative_mpc(
     soft_weight: float = 1e3,
     margin: float = 0.02,
     reject_disturbance: bool = False,
-    estimator_gain: float = ESTIMATOR_GAIN,
+    estimator_gain: float | Literal["auto"] = "auto",
     iteration_limit: int = ITERATION_LIMIT,
 ) -> TeamPolicy:
     """The policy of chapter 7. Where vehicles run on rails, its answer is its estimate.

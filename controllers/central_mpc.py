@@ -30,7 +30,6 @@ from quad_envs.tasks import TeamTask
 from quad_envs.turning import TURN_RATE, turning_rates, with_turn_rates
 
 from .controller import PLANT_SIZE, Decision, as_array
-from .disturbance import ESTIMATOR_GAIN
 from .fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, limit_command
 from .model import sdc_pair
 from .mpc import MpcOptions, mpc_data
@@ -129,7 +128,7 @@ class CentralMpc:
         self.task, self.horizon, self.alpha = task, int(horizon), float(alpha)
         self.braking_time, self.swirl = float(braking_time), float(swirl)
         options = MpcOptions(
-            "osqp", "heading", "attitude", soft_weight, margin, False, ESTIMATOR_GAIN, ITERATION_LIMIT
+            "osqp", "heading", "attitude", soft_weight, margin, False, "auto", ITERATION_LIMIT
         )
         self._data = mpc_data(task, self.horizon, options)
         self._pairs = np.stack(np.triu_indices(task.vehicles, 1), axis=-1)

@@ -27,7 +27,7 @@ from .consensus import ConsensusOptions, Neighbour, TargetModel, require_message
 from .consensus_kernels import CONSENSUS_SCRATCH
 from .controller import PLANT_SIZE, as_array
 from .cooperative_kernels import NAMES, RowLayout, Team, decide_team, pose_row
-from .disturbance import ESTIMATOR_GAIN, ESTIMATOR_SIZE, N_DISTURBANCE
+from .disturbance import ESTIMATOR_SIZE, N_DISTURBANCE
 from .mpc import MpcOptions, mpc_data, require_choice
 from .mpc_kernels import MEMORY_STAGE, buffer_size, carve
 from .ocp import IntArray, OcpQp, StateRows, concatenate_rows
@@ -87,7 +87,8 @@ class CooperativeMpc:
         soft_weight: Exact penalty per unit of the other state rows; inf makes them hard.
         margin: What the plan keeps from each limit of the task, in its SI unit.
         reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
-        estimator_gain: Share of each new residual in the estimate, in (0, 1].
+        estimator_gain: Share of each new residual in the estimate, in (0, 1]; "auto" takes it from
+            `task.sensor_noise`, 0.5 without any.
         iteration_limit: Largest number of active-set steps of a solve; 0 for one that grows with it.
 
     Raises:
@@ -120,7 +121,7 @@ class CooperativeMpc:
         soft_weight: float = 1e3,
         margin: float = 0.02,
         reject_disturbance: bool = False,
-        estimator_gain: float = ESTIMATOR_GAIN,
+        estimator_gain: float | Literal["auto"] = "auto",
         iteration_limit: int = ITERATION_LIMIT,
     ) -> None:
         if horizon != int(horizon) or horizon < 1:

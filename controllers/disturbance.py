@@ -109,7 +109,7 @@ def _residual(plant: Array, predicted: Array, dt: float, c: Array, out: Array) -
 def update_estimate(
     plant: Array,
     memory: Array,
-    gain: float,
+    gain: Array,
     c: Array,
     dt: float,
     force_max: Array,
@@ -128,7 +128,7 @@ def update_estimate(
         plant: Measured [p, V_B, Theta, Omega, F], (16,).
         memory: As `remember` left it, (ESTIMATOR_SIZE,): whether it holds a sample, the estimate, the
             disturbance revealed then, plant and command then.
-        gain: Share of each correction, in (0, 1].
+        gain: Share of each correction, in (0, 1], (6,).
         c: QuadrotorParams.coefficients().
         dt: Control period, s.
         force_max: Largest force of each rotor, (4,), N.
@@ -158,7 +158,7 @@ def update_estimate(
     arm = math.hypot(c[ROLL_GAIN], c[ROLL_CROSS]) / c[INV_JX]
     for i in range(N_DISTURBANCE):
         limit = _FORCE_SHARE * weight if i >= 3 else _TORQUE_SHARE * 0.5 * arm * weight
-        estimate[i] = min(max(estimate[i] + gain * correction[i], -limit), limit)
+        estimate[i] = min(max(estimate[i] + gain[i] * correction[i], -limit), limit)
 
 
 @kernel

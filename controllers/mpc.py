@@ -14,7 +14,8 @@ from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, VELOCITY,
 from quad_envs.tasks import BaseTask, Task
 
 from .controller import Decision, as_one_row, as_rows, first_non_finite, raise_non_finite
-from .disturbance import ESTIMATOR_SIZE
+from .disturbance import ESTIMATOR_SIZE, N_DISTURBANCE
+from .estimator_gain import estimator_gains
 from .fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXED_WEIGHT
 from .model import hover_pair
 from .mpc_kernels import (
@@ -67,7 +68,7 @@ class MpcOptions:
     soft_weight: float
     margin: float
     reject_disturbance: bool
-    estimator_gain: float
+    estimator_gain: float | Literal["auto"]
     iteration_limit: int
     Q: ArrayLike | None = None  # weight of the state: number, diagonal (12,) or matrix; None: the reward's
     R: ArrayLike | None = None  # weight of the forces: number, diagonal (4,) or matrix; None: the reward's
@@ -84,8 +85,8 @@ class MpcOptions:
             raise ValueError(
                 f"margin must be a finite number >= 0, in SI units of each limit, got {self.margin!r}"
             )
-        if not 0.0 < self.estimator_gain <= 1.0:
-            raise ValueError(f"estimator_gain must lie in (0, 1], got {self.estimator_gain!r}")
+        if self.estimator_gain != "auto" and not 0.0 < self.estimator_gain <= 1.0:
+            raise ValueError(f"estimator_gain must be 'auto' or lie in (0, 1], got {self.estimator_gain!r}")
         if not self.plan_tilt > 0.0:
             raise ValueError(f"plan_tilt must be > 0 rad, got {self.plan_tilt!r}; math.inf is no limit")
         if self.iteration_limit < 0:
@@ -144,6 +145,15 @@ def plan_tilt_rows(tilt: float, limits: Limits, horizon: int) -> StateRows:
     return output_rows(np.eye(N_STATE)[ATTITUDE][:2], -bound, bound, TILT_WEIGHT, horizon)
 
 
+def estimator_gain(task: BaseTask, options: MpcOptions) -> Array:
+    """Gain of each channel of the disturbance estimator, (6,); zeros without one."""
+    if not options.reject_disturbance:
+        return np.zeros(N_DISTURBANCE)
+    if options.estimator_gain == "auto":
+        return estimator_gains(task)
+    return np.full(N_DISTURBANCE, float(options.estimator_gain))
+
+
 def mpc_data(task: BaseTask, horizon: int, options: MpcOptions) -> MpcData:
     """The constants of a controller."""
     params = task.params
@@ -172,7 +182,7 @@ def mpc_data(task: BaseTask, horizon: int, options: MpcOptions) -> MpcData:
         force_max=task.force_max,
         rate_step=float(task.limits.rate * task.dt),
         lag=rotor_lag(task),
-        gain=float(options.estimator_gain) if options.reject_disturbance else 0.0,
+        gain=estimator_gain(task, options),
         heading=options.frame == "heading",
         attitude=options.frame == "heading" and options.velocity_reference == "attitude",
         kinematics=False,

@@ -51,7 +51,7 @@ class MpcData(NamedTuple):
     force_max: Array  # (4,), N
     rate_step: float
     lag: float  # of slow rotors, s, see `rotor_lag`
-    gain: float  # of the disturbance estimator, 0 for none
+    gain: Array  # (6,), of the disturbance estimator, 0 for none
     heading: bool  # whether the problem is posed at the present position and heading
     attitude: bool  # whether v_ref is turned into the present body axes
     kinematics: bool  # whether the model turns body rates into Euler rates at the present attitude
@@ -494,5 +494,5 @@ def end_row(
         kept[1 + N_INPUT * N + i] = s.working[i]
     kept[0] = 1.0 if level <= PREVIOUS_PLAN else 0.0
     limit_command(plan, last, data.rate_step, data.force_max, command)  # also what a backend leaves over
-    if data.gain > 0.0:
+    if data.gain[0] > 0.0:
         remember(plant, command, revealed, s.estimate, kept[1 + MEMORY_STAGE * N :])

@@ -12,7 +12,6 @@ from quad_envs.parameters import N_STATE, Array
 from quad_envs.tasks import Task
 
 from .controller import first_non_finite
-from .disturbance import ESTIMATOR_GAIN
 from .fallback import RELAXED
 from .linalg import copy
 from .model import sdc_matrix, zero_order_hold
@@ -193,7 +192,8 @@ class SdcNmpc(Mpc):
         soft_weight: Exact penalty per unit of a state row; inf makes the rows hard.
         margin: What the plan keeps from each state limit, in its SI unit: cover for the unmodelled rotor lag.
         reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
-        estimator_gain: Share of each new residual in the estimate, in (0, 1].
+        estimator_gain: Share of each new residual in the estimate, in (0, 1]; "auto" takes it from
+            `task.sensor_noise`, 0.5 without any.
         iteration_limit: Largest number of active-set steps of a solve; 0 for one that grows with it.
         Q: Weight of the state, a number, the diagonal (12,) or a matrix; the reward's by default.
         R: Weight of the rotor forces, a number, the diagonal (4,) or a matrix; the reward's by default.
@@ -219,7 +219,7 @@ class SdcNmpc(Mpc):
         soft_weight: float = SOFT_WEIGHT,
         margin: float = 0.02,
         reject_disturbance: bool = False,
-        estimator_gain: float = ESTIMATOR_GAIN,
+        estimator_gain: float | Literal["auto"] = "auto",
         iteration_limit: int = ITERATION_LIMIT,
         Q: ArrayLike | None = None,
         R: ArrayLike | None = None,
