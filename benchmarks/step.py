@@ -146,7 +146,7 @@ def measure(seconds: float) -> dict[str, dict[str, float]]:
 
 
 def ratios(found: dict[str, dict[str, float]]) -> dict[str, float]:
-    """The comparisons that the README quotes."""
+    """The comparisons that docs/results/speed.md quotes."""
     rate = {name: row["control steps/s"] for name, row in found.items()}
     out = {"bare step / one env": rate["bare step, 5 substeps"] / rate["one env, 5 substeps"]}
     for name in ("l2f: one, step + observe", "l2f: vector of 1024"):
