@@ -1,1 +1,1 @@
-"""Speed: our own, and side by side with peers in one run. Every claim of docs/results/speed.md is printed here."""
+"""Speed: our own, and beside peers in one run. Every claim of docs/results/speed.md is printed here."""
