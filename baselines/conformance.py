@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from .environments import is_parallel, make_env
 from .errors import PolicyCheckError
+from .pairing import require_pair
 from .policy import Policy
 
 _STEPS = 12  # of each flight
@@ -33,11 +34,16 @@ def check_policy(policy: Policy, env: Any, seed: int = 0) -> None:
         seed: Of the first flight.
 
     Raises:
-        PolicyCheckError: If a test fails; the message says which and what was expected.
+        PolicyCheckError: If a test fails, or the policy was made for another task; the message says which
+            and what was expected.
     """
     if not callable(getattr(policy, "predict", None)):
         raise PolicyCheckError(f"{policy!r} has no predict(observation, state, episode_start, deterministic)")
     env = make_env(env) if isinstance(env, str) else env
+    try:
+        require_pair(policy, env)
+    except ValueError as error:
+        raise PolicyCheckError(str(error)) from error
     if not is_parallel(env):
         space, flights = env.action_space, _collect(policy, env, seed)
     else:

@@ -53,7 +53,7 @@ def task_of(source: Any) -> BaseTask:
             return task_of(env)
         finally:
             env.close()
-    task = _find_task(source)
+    task = find_task(source)
     if not isinstance(task, BaseTask):
         raise _no_task(source)
     _check_spaces(source, task)
@@ -73,47 +73,13 @@ def require_own_task(env: Any) -> None:
         )
     if isinstance(getattr(getattr(env, "unwrapped", env), "task", None), BaseTask):
         return
-    if isinstance(_find_task(env), BaseTask):
+    if isinstance(find_task(env), BaseTask):
         raise ValueError(
             f"a {type(env).__name__} hides the plants of its environments: use gymnasium.make_vec(..., "
             'vectorization_mode="vector_entry_point"), its default for the ids of this suite, or a single '
             "environment"
         )
     raise _no_task(env)
-
-
-_REWRITERS = (
-    gymnasium.ObservationWrapper,
-    gymnasium.ActionWrapper,
-    gymnasium.vector.VectorObservationWrapper,
-    gymnasium.vector.VectorActionWrapper,
-)
-_HARMLESS = (
-    gymnasium.wrappers.FlattenObservation,
-    gymnasium.wrappers.ClipAction,
-)  # same numbers for a flat Box
-
-
-def require_own_numbers(policy: Any, env: Any) -> None:
-    """Check that a policy of a task gets that task's observations and that its actions arrive as they are.
-
-    A policy that has a `task` reads its layout; a wrapper that normalises, delays or rescales would feed it
-    other numbers in the same shape. What a policy without a `task` wants, only its owner knows.
-
-    Raises:
-        ValueError: If a wrapper stands between them; it names the wrapper and the remedy.
-    """
-    if not isinstance(getattr(policy, "task", None), BaseTask):
-        return
-    inner = env
-    while isinstance(inner, gymnasium.Wrapper | gymnasium.vector.VectorWrapper):
-        if isinstance(inner, _REWRITERS) and not isinstance(inner, _HARMLESS):
-            name = getattr(policy, "name", type(policy).__name__)
-            raise ValueError(
-                f"the wrapper {type(inner).__name__} changes observations or actions, and policy {name!r} "
-                "reads and writes those of its task: evaluate it in env.unwrapped, or without the wrapper"
-            )
-        inner = inner.env
 
 
 def _no_task(source: Any) -> ValueError:
@@ -123,7 +89,8 @@ def _no_task(source: Any) -> ValueError:
     )
 
 
-def _find_task(source: Any) -> Any:
+def find_task(source: Any) -> Any:
+    """What is called `task` of an environment of whatever kind; None where nothing is."""
     if is_parallel(source):  # a wrapper that adds to the observation brings a task that says so
         return getattr(source, "task", None)
     task = getattr(getattr(source, "unwrapped", source), "task", None)

@@ -184,6 +184,8 @@ def evaluate(
     episodes: int = 20,
     seed: int = 0,
     on_episode: Callable[[Episode], None] | None = None,
+    *,
+    mismatch: bool = False,
 ) -> Evaluation:
     """Fly a policy from several starts and measure it.
 
@@ -196,6 +198,8 @@ def evaluate(
         episodes: Number of flights, >= 1.
         seed: Flight i starts with the environment seed `seed + i`.
         on_episode: Called with each flight, of a team with that of each vehicle, to save or plot it.
+        mismatch: Whether the policy may be one of another task on purpose, see `run_episodes`. Conditions
+            with `randomize` need it not: the task knows the nominal vehicle.
 
     Raises:
         ValueError: If the id or the policy's name is unknown, episodes < 1, or as `run_episodes` says.
@@ -203,7 +207,7 @@ def evaluate(
     env, size = make_env(env) if isinstance(env, str) else env, 1
     policy = make_policy(policy, env) if isinstance(policy, str) else policy
     records, times, team_times = [], [], []
-    for episode in run_episodes(policy, env, episodes, seed):
+    for episode in run_episodes(policy, env, episodes, seed, mismatch=mismatch):
         records.append(measure(episode))
         size = episode.team_size
         times.append(episode.decision_times.astype(np.float32))

@@ -20,8 +20,9 @@ from quad_envs.parameters import Array
 from quad_envs.tasks import BaseTask, TeamTask
 
 from .checks import require_whole
-from .environments import is_parallel, require_own_numbers, require_own_task
+from .environments import is_parallel, require_own_task
 from .episode import INFO, Episode, Recorder, Said
+from .pairing import require_pair
 from .policy import Policy
 from .team_signals import TEAM_INFO, WRAPPER_INFO
 
@@ -36,7 +37,9 @@ def is_privileged(policy: Any) -> bool:
     return bool(getattr(policy, "privileged", False))
 
 
-def run_episodes(policy: Policy, env: Any, episodes: int, seed: int = 0) -> Iterator[Episode]:
+def run_episodes(
+    policy: Policy, env: Any, episodes: int, seed: int = 0, *, mismatch: bool = False
+) -> Iterator[Episode]:
     """Fly episodes one after the other, and yield each as soon as it is complete.
 
     Args:
@@ -46,16 +49,18 @@ def run_episodes(policy: Policy, env: Any, episodes: int, seed: int = 0) -> Iter
             teams gives one episode per agent, too.
         episodes: Number of episodes, >= 1.
         seed: Seed of the first one, >= 0.
+        mismatch: Whether the policy may be one of another task (vehicle, limits, weights) on purpose; the
+            observations must have the same layout.
 
     Raises:
-        ValueError: If episodes < 1, the seed < 0, the environment is not of this suite, a wrapper changes the
-            numbers that a policy of the task reads or writes, a vector environment resets in the same step,
-            or a privileged policy cannot see the truth.
+        ValueError: If episodes < 1, the seed < 0, the environment is not of this suite, the policy was made
+            for another task, a wrapper changes the numbers that it reads or writes, a vector environment
+            resets in the same step, or a privileged policy cannot see the truth.
     """
     require_whole("episodes", episodes, 1)
     require_whole("seed", seed, 0)
     require_own_task(env)
-    require_own_numbers(policy, env)
+    require_pair(policy, env, mismatch)
     if is_privileged(policy) and not is_parallel(env):
         raise ValueError(
             f"{type(policy).__name__} decides from the truth about one team: fly it in a ParallelEnv, "

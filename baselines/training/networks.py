@@ -213,6 +213,8 @@ class NetworkPolicy:
         ValueError: If the task's observations lack what the network sees, or its actions have another size.
     """
 
+    decides_from = ("layout", "limits.kappa")  # of the task: what it sees, and the scale of its outputs
+
     def __init__(self, network: Network, task: BaseTask, name: str, kind: str = "") -> None:
         if not isinstance(task, Task | TeamTask):
             raise ValueError(f"a network needs a Task or a TeamTask, got {task!r}")
