@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+from quad_envs.lazy import load_public, public_names
 
 if TYPE_CHECKING:
     from .benchmark import run_benchmark
@@ -83,6 +84,8 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name in _PUBLIC:
-        return getattr(import_module(f".{_PUBLIC[name]}", __name__), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return load_public(__name__, _PUBLIC, name)
+
+
+def __dir__() -> list[str]:
+    return public_names(globals())

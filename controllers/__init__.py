@@ -1,5 +1,7 @@
 """Control of a vehicle and of teams: linear, state-dependent and exact MPC, feedback laws, and solvers."""
 
+from quad_envs.lazy import public_names
+
 from .collision import AvoidanceOptions
 from .consensus import ConsensusOptions, TargetEstimate, consensus_reference
 from .controller import Controller, Decision
@@ -37,3 +39,7 @@ __all__ = [
     "lqr_gain",
     "sdc_pair",
 ]
+
+
+def __dir__() -> list[str]:
+    return public_names(globals(), "estimation", "solvers")

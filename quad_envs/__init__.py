@@ -5,7 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from .registration import register
+from .lazy import load_public, public_names
+from .registration import TEAMS, register
 
 if TYPE_CHECKING:
     from .disturbances import Gusts, Impulse, Steady, TorquePulse
@@ -76,6 +77,9 @@ _PUBLIC = {
     "toward_leader": "graphs",
 }
 
+# The modules of teams, `formation_v0` and so on.
+_TEAM_MODULES = [module.rpartition(".")[2] for module in TEAMS.values()]
+
 __all__ = [
     "Aircraft",
     "ConstantVelocity",
@@ -114,9 +118,13 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name in _PUBLIC:
-        return getattr(import_module(f".{_PUBLIC[name]}", __name__), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name in _TEAM_MODULES:
+        return import_module(f".{name}", __name__)
+    return load_public(__name__, _PUBLIC, name)
+
+
+def __dir__() -> list[str]:
+    return public_names(globals(), *_TEAM_MODULES)
 
 
 register()

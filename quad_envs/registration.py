@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NoReturn
 
 import gymnasium
 import pettingzoo
+from gymnasium.envs.registration import EnvSpec
 
 from .episode_limit import SuiteSpec
+from .names import shown
 
 _ENTRY = "quad_envs.envs.tracking:TrackingEnv"
 _VECTOR_ENTRY = "quad_envs.envs.tracking_vector:TrackingVectorEnv"
@@ -70,11 +72,35 @@ def tracking_spec(env_id: str, defaults: dict[str, Any]) -> SuiteSpec:
     )
 
 
+def refuse_team(env_id: str, num_envs: int = 8, **kwargs: Any) -> NoReturn:
+    """What `gymnasium.make` and `make_vec` call for an id of several vehicles.
+
+    Raises:
+        gymnasium.error.NameNotFound: Always; it shows the lines that make the environment.
+    """
+    module = TEAMS[env_id]
+    given = [f"{name}={shown(value)}" for name, value in kwargs.items() if value is not None]
+    raise gymnasium.error.NameNotFound(
+        f"{env_id} has several vehicles: it is a PettingZoo environment, not one of Gymnasium. Make it with "
+        f"{module}.parallel_env({', '.join(given)}), or many teams in one call with "
+        f"{module}.vector_env({', '.join([f'num_teams={num_envs}', *given])})"
+    )
+
+
 def register() -> None:
-    """Register every id with Gymnasium or PettingZoo; calling it again changes nothing."""
+    """Register every id with Gymnasium or PettingZoo; calling it again changes nothing.
+
+    Gymnasium knows the ids of teams, too, so that it says where they are.
+    """
     for env_id, defaults in TRACKING.items():
         if env_id not in gymnasium.registry:
             gymnasium.registry[env_id] = tracking_spec(env_id, defaults)
+    for env_id in TEAMS:
+        if env_id not in gymnasium.registry:
+            entry, own = f"{__name__}:{refuse_team.__name__}", {"env_id": env_id}
+            gymnasium.registry[env_id] = EnvSpec(
+                env_id, entry_point=entry, vector_entry_point=entry, kwargs=own
+            )
     if hasattr(pettingzoo, "register"):  # from PettingZoo 1.27 on
         for env_id, module in TEAMS.items():
             if env_id not in pettingzoo.parallel_registry:

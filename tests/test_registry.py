@@ -1,15 +1,21 @@
 """Every registered id passes the checkers of its users, and importing the package stays cheap."""
 
+import ast
+import inspect
+import re
 import subprocess
 import sys
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
+import baselines
+import controllers
 import quad_envs
-from quad_envs.registration import TRACKING, register
+from quad_envs.registration import TEAMS, TRACKING, register
 
 # A symmetric box that is unbounded in the observation is what Gymnasium's checker warns of, nothing else.
 pytestmark = pytest.mark.filterwarnings("ignore:.*observation space (minimum|maximum) value is .*infinity.*")
@@ -53,11 +59,70 @@ def test_registering_twice_changes_nothing():
     assert gym.registry == before
 
 
-def test_every_public_name_exists():
-    for name in quad_envs.__all__:
-        assert getattr(quad_envs, name) is not None
+@pytest.mark.parametrize("package", [quad_envs, controllers, baselines], ids=lambda package: package.__name__)
+def test_every_public_name_exists_and_is_in_dir(package):
+    for name in package.__all__:
+        assert getattr(package, name) is not None
+    assert set(package.__all__) <= set(dir(package))
+    assert not [name for name in dir(package) if name.startswith("_") and not name.endswith("__")]
     with pytest.raises(AttributeError, match="no attribute 'Nonsense'"):
-        _ = quad_envs.Nonsense
+        _ = package.Nonsense
+
+
+@pytest.mark.parametrize("package", [quad_envs, baselines], ids=lambda package: package.__name__)
+def test_names_for_readers_for_type_checkers_and_for_loading_are_the_same(package):
+    """`__all__` and the imports under TYPE_CHECKING are for tools that do not run the package."""
+    tree = ast.parse(inspect.getsource(package))
+    shown = next(node for node in tree.body if isinstance(node, ast.If))
+    checked = {alias.name: node.module for node in shown.body for alias in node.names}
+    assert checked == package._PUBLIC
+    assert list(package.__all__) == sorted(package._PUBLIC)
+
+
+def test_public_names_are_listed_before_anything_is_loaded():
+    code = (
+        "import sys, quad_envs, baselines\nprint(*dir(quad_envs), *dir(baselines))\n"
+        "assert 'numba' not in sys.modules"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert {"Helix", "formation_v0", "make_policy", "train"} <= set(done.stdout.split())
+
+
+def test_the_modules_of_teams_are_attributes():
+    code = "import quad_envs; print(quad_envs.formation_v0.parallel_env().possible_agents)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "quad_0" in done.stdout
+
+
+@pytest.mark.parametrize("env_id", TEAMS)
+@pytest.mark.parametrize(
+    "make",
+    [
+        gym.make,
+        lambda env_id, **kwargs: gym.make(f"quad_envs:{env_id}", **kwargs),
+        lambda env_id, **kwargs: gym.make_vec(env_id, num_envs=3, **kwargs),
+        lambda env_id, **kwargs: gym.make_vec(env_id, num_envs=3, vectorization_mode="sync", **kwargs),
+        lambda env_id, **kwargs: gym.make(gym.spec(env_id), **kwargs),
+        lambda env_id, **kwargs: gym.make(EnvSpec.from_json(gym.spec(env_id).to_json()), **kwargs),
+    ],
+    ids=["make", "module", "make_vec", "sync", "spec", "json"],
+)
+def test_gymnasium_says_that_teams_are_pettingzoo_and_shows_a_line_that_makes_them(make, env_id):
+    with pytest.raises(
+        gym.error.NameNotFound, match="is a PettingZoo environment, not one of Gymnasium"
+    ) as said:
+        make(env_id, dt=0.1, time_limit=2.0)
+    lines = re.findall(r"quad_envs\.\w+\.\w+\([^)]*\)", str(said.value))
+    parallel, vector = (eval(line) for line in lines)  # what the message shows, typed as it stands
+    assert parallel.task.dt == 0.1 and parallel.task.env_id == env_id
+    assert vector.unwrapped.task.episode_steps == 20
+
+
+def test_the_listing_of_gymnasium_names_every_id_of_the_suite_once():
+    listed = gym.pprint_registry(disable_print=True).split()
+    assert [listed.count(env_id) for env_id in (*TRACKING, *TEAMS)] == [1] * 10
+    with pytest.raises(gym.error.NameNotFound, match="Did you mean: `Formation`"):
+        gym.make("quad/Formations-v0")
 
 
 @pytest.mark.parametrize(
