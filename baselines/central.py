@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controllers.central_mpc import CentralMpc
+from controllers.controller import Decision
 from quad_envs.constraints import actions_from_forces
 from quad_envs.observations import N_REFERENCE
 from quad_envs.parameters import N_INPUT, Array
 from quad_envs.tasks import TeamTask
 
 from .policy import Actions, PolicyState
-from .rows import as_starts, state_of
+from .rows import as_starts, state_of, times_left
 
 
 class CentralMpcPolicy:
@@ -108,16 +109,19 @@ class CentralMpcPolicy:
         actions = np.zeros((n, self.task.vehicles, self.task.action_size), dtype=np.float32)
         memory = np.where(start[:, None], 0.0, state.memory)
         fallbacks = np.where(start[:, None], 0, state.fallbacks)
+        left: NDArray[np.int64] = np.where(start, 0, times_left(state))
         iterations = np.zeros(n, dtype=np.int64)
         for j in range(n):
-            actions[j, :, :N_INPUT], memory[j], level, iterations[j] = self._decide(rows[j], memory[j])
-            fallbacks[j, level] += 1
+            actions[j, :, :N_INPUT], memory[j], decision = self._decide(rows[j], memory[j])
+            iterations[j] = decision.iterations[0]
+            fallbacks[j, decision.fallback[0]] += 1
+            left[j] += np.any(decision.left_model)
         worst = np.maximum(iterations, np.where(start, 0, state.worst_iterations))
-        kept = PolicyState(memory, fallbacks, iterations, worst)
+        kept = PolicyState(memory, fallbacks, iterations, worst, left_model=left)
         return actions[0] if one else actions, kept
 
-    def _decide(self, row: Array, memory: Array) -> tuple[Actions, Array, int, int]:
-        """Actions (N, 4) of one team, its memory, fallback and iterations."""
+    def _decide(self, row: Array, memory: Array) -> tuple[Actions, Array, Decision]:
+        """Actions (N, 4) of one team, its memory, and how they were found."""
         task, size = self.task, self.controller.memory_size
         plants = row[self._slices["plants"]].reshape(task.vehicles, -1)
         last = np.full((task.vehicles, N_INPUT), task.hover_force)
@@ -126,7 +130,7 @@ class CentralMpcPolicy:
         decision = self.controller.decide(plants, self._preview(row), self._slots, last, memory[:size])
         actions = actions_from_forces(decision.command, task.hover_force, task.force_max)
         kept = np.concatenate([decision.memory, [1.0], decision.command.ravel()])
-        return actions, kept, int(decision.fallback[0]), int(decision.iterations[0])
+        return actions, kept, decision
 
     def _preview(self, row: Array) -> Array:
         """Rows (stages, 8) that the slots are relative to: the leader's, or the target as it goes on."""

@@ -153,8 +153,9 @@ class Results:
             first, last = ([format_number(f * row[key]) for _, key, f in part] for part in (before, after))
             name = row["policy"] + (" (privileged)" if row.get("privileged") else "")
             failed = sum(row[name] for name in _FAILED)
-            lines.append([name, *first, str(row["crashed"]), *last, str(failed)])
-        header = ["policy", *titles[0], "crashes", *titles[1], "fallbacks"]
+            counts = str(failed), str(row["left_model"])
+            lines.append([name, *first, str(row["crashed"]), *last, *counts])
+        header = ["policy", *titles[0], "crashes", *titles[1], "fallbacks", "left model"]
         seeds = f"seeds {self.suite.seed} to {self.suite.seed + self.suite.episodes - 1}"
         note = "" if rows[0].get("spanning_tree", True) else f"\nnote: {NO_SPANNING_TREE}"
         return f"{env.title}, {seeds}{note}\n{format_table(header, lines)}"

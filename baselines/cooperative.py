@@ -27,7 +27,7 @@ from .cooperative_decoding import (
 )
 from .estimation import AgentFilters, EstimatorPolicy, SharedEstimatePolicy, make_estimator, shared_estimates
 from .policy import N_FALLBACKS, Actions, Counts, Estimates, PolicyState
-from .rows import not_finite
+from .rows import not_finite, times_left
 from .team_policies import Flags, TeamPolicy
 
 EstimateSource = Literal["own", "shared"]
@@ -88,15 +88,18 @@ class CooperativePolicy(TeamPolicy):
         n, task = len(start), self.task
         actions = np.empty((n, task.action_size), dtype=np.float32)
         counts: Counts = np.empty((n, N_FALLBACKS), dtype=np.int64)
-        worst, memory = np.empty(n, dtype=np.int64), np.empty((n, self.memory_size))
+        worst, left = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+        memory = np.empty((n, self.memory_size))
         encode_decisions(
             decision.command,
             decision.plan.reshape(n, -1),
             decision.fallback,
             decision.iterations,
+            decision.left_model,
             start,
             state.fallbacks,
             state.worst_iterations,
+            times_left(state),
             float(task.hover_force),
             task.force_max,
             float(task.dt),
@@ -105,9 +108,10 @@ class CooperativePolicy(TeamPolicy):
             actions,
             counts,
             worst,
+            left,
             memory,
         )
-        return actions, PolicyState(memory, counts, decision.iterations, worst, estimates)
+        return actions, PolicyState(memory, counts, decision.iterations, worst, estimates, left)
 
 
 class ConsensusMpc(CooperativePolicy):

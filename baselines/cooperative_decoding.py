@@ -133,9 +133,11 @@ def encode_decisions(
     plans: Array,
     fallback: Counts,
     iterations: Counts,
+    left: Counts,
     start: NDArray[np.bool_],
     counts: Counts,
     worst: Counts,
+    times_left: Counts,
     hover: float,
     force_max: Array,
     dt: float,
@@ -144,6 +146,7 @@ def encode_decisions(
     actions: Actions,
     new_counts: Counts,
     new_worst: Counts,
+    new_left: Counts,
     memory: Array,
 ) -> None:
     """Commands and plans to actions, the episode's statistics brought up to date, the memory packed.
@@ -153,9 +156,11 @@ def encode_decisions(
         plans: p relative to the present position and v for k+1..k+N, (n, 6 N); past its end it moves on.
         fallback: (n,), how each was found.
         iterations: (n,).
+        left: (n,), 1 where it left the validity of its model.
         start: (n,) bool, rows whose statistics begin anew.
         counts: Statistics so far, (n, 5).
         worst: Statistics so far, (n,).
+        times_left: Statistics so far, (n,).
         hover: Force of action 0, N.
         force_max: Force of action 1 of each rotor, (4,), N.
         dt: Control period, s.
@@ -164,13 +169,14 @@ def encode_decisions(
         actions: Output, (n, 4 + 6 N_p) float32.
         new_counts: Output, (n, 5).
         new_worst: Output, (n,).
+        new_left: Output, (n,).
         memory: Output, (n, a + b).
     """
     m = first.shape[1]
     last = plans.shape[1] // N_PLAN_STAGE - 1
     encode_commands(
-        commands, fallback, iterations, start, counts, worst, hover, force_max, actions[:, :4], new_counts,
-        new_worst,
+        commands, fallback, iterations, left, start, counts, worst, times_left, hover, force_max,
+        actions[:, :4], new_counts, new_worst, new_left,
     )  # fmt: skip
     for j in range(commands.shape[0]):
         for c in range(actions.shape[1] - 4):

@@ -51,6 +51,7 @@ class Episode(NamedTuple):
     crash_cause: str = (
         ""  # one of `task.crash_causes`; empty too where another vehicle ended the team's flight
     )
+    left_model: int = 0  # decisions whose state or plan left where the policy's model holds
     team_size: int = 1  # vehicles that were decided for at once: the team took team_size * decision_times
     signals: Mapping[str, NDArray[Any]] = {}
 
@@ -96,6 +97,7 @@ class Recorder:
         self.ends = np.zeros((3, n), dtype=np.bool_)  # crashed, terminated, truncated
         self.causes = np.zeros(n, dtype=np.int64)  # places in `task.crash_causes`
         self.fallbacks, self.worst = np.zeros((n, N_FALLBACKS), dtype=np.int64), np.zeros(n, dtype=np.int64)
+        self.left = np.zeros(n, dtype=np.int64)
         self.steps: list[tuple[NDArray[Any], Array, NDArray[Any]]] = []
         self.seconds: list[float] = []
         self.plants: list[Array] = [plants]
@@ -140,6 +142,8 @@ class Recorder:
             n = len(live)
             self.fallbacks[live] = np.broadcast_to(state.fallbacks, (n, N_FALLBACKS))[live]
             self.worst[live] = np.broadcast_to(state.worst_iterations, (n,))[live]
+            if state.left_model is not None:
+                self.left[live] = np.broadcast_to(state.left_model, (n,))[live]
         self.live &= ~(self.ends[1] | self.ends[2])
 
     def episodes(self) -> Iterator[Episode]:
@@ -168,6 +172,7 @@ class Recorder:
                 truncated=bool(self.ends[2, j]),
                 agent=self.agents[j],
                 crash_cause=self.task.crash_causes[self.causes[j]],
+                left_model=int(self.left[j]),
                 team_size=self.team_size,
                 signals={name: entries[:steps, j].copy() for name, entries in signals.items()},
             )

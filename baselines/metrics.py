@@ -63,6 +63,7 @@ class Record(NamedTuple):
     worst_violation: dict[str, float]  # constraint name -> largest excess over its limit, SI
     agent: str = ""
     crash_cause: str = ""  # one of `task.crash_causes`
+    left_model: int = 0  # decisions whose state or plan left where the policy's model holds
     # Of a team's vehicle; nan where the task or the policy does not have them.
     formation_rms: float = _NAN  # m, distance to the own slot
     formation_final: float = _NAN  # m, its mean over the last second
@@ -99,7 +100,7 @@ AVERAGED = (
 )
 # Columns that are nan after a crash, and therefore not averaged over what is left.
 CUT_SHORT = ("cost", "position_rms", "steady_rms", "settling_time")
-COUNTED = ("crashed", "relaxed", "previous_plan", "clipped_sdre", "hover")
+COUNTED = ("crashed", "relaxed", "previous_plan", "clipped_sdre", "hover", "left_model")
 
 
 def measure(episode: Episode) -> Record:
@@ -137,6 +138,7 @@ def measure(episode: Episode) -> Record:
         worst_violation=dict(zip(task.constraint_names, excess.tolist(), strict=True)),
         agent=episode.agent,
         crash_cause=episode.crash_cause,
+        left_model=episode.left_model,
         **measure_team(episode),
     )
 

@@ -56,6 +56,7 @@ class PolicyState(NamedTuple):
     iterations: Counts  # (n,), solver iterations of the last decision
     worst_iterations: Counts  # (n,), most iterations of a decision in this episode
     estimates: Estimates | None = None  # of policies that estimate a target
+    left_model: Counts | None = None  # (n,), decisions of this episode outside their model; None: none
 
 
 @runtime_checkable

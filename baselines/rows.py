@@ -52,10 +52,20 @@ def state_of(state: PolicyState | None, n: int, memory_size: int) -> PolicyState
     if state is None:
         count = np.zeros(n, dtype=np.int64)
         memory = np.zeros((n, memory_size))
-        return PolicyState(memory, np.zeros((n, N_FALLBACKS), dtype=np.int64), count, count)
+        fallbacks = np.zeros((n, N_FALLBACKS), dtype=np.int64)
+        return PolicyState(memory, fallbacks, count, count, left_model=count)
     if state.worst_iterations.shape[0] != n:
         raise ValueError(f"state has {state.worst_iterations.shape[0]} rows, the observation {n}")
     return state
+
+
+def times_left(state: PolicyState) -> NDArray[np.int64]:
+    """`state.left_model`, zeros where a state has none."""
+    return (
+        np.zeros(len(state.worst_iterations), dtype=np.int64)
+        if state.left_model is None
+        else state.left_model
+    )
 
 
 @inline_kernel

@@ -17,7 +17,7 @@ from quad_envs.tasks import Task
 
 from .checks import require_whole
 from .policy import N_FALLBACKS, Actions, Counts, PolicyState
-from .rows import as_rows, as_starts, first_not_finite, not_finite, state_of
+from .rows import as_rows, as_starts, first_not_finite, not_finite, state_of, times_left
 
 _PLANT_SIZE, _N_DISTURBANCE = 16, 6
 
@@ -80,14 +80,17 @@ def encode_commands(
     commands: Array,
     fallback: Counts,
     iterations: Counts,
+    left: Counts,
     start: NDArray[np.bool_],
     counts: Counts,
     worst: Counts,
+    times_left: Counts,
     hover: float,
     force_max: Array,
     actions: Actions,
     new_counts: Counts,
     new_worst: Counts,
+    new_left: Counts,
 ) -> None:
     """Commands to actions, and the episode's statistics brought up to date.
 
@@ -95,14 +98,17 @@ def encode_commands(
         commands: (n, 4), N.
         fallback: (n,), how each was found.
         iterations: (n,).
+        left: (n,), 1 where it left the validity of its model.
         start: (n,) bool, rows whose statistics begin anew.
         counts: Statistics so far, (n, 5).
         worst: Statistics so far, (n,).
+        times_left: Statistics so far, (n,).
         hover: Force of action 0, N.
         force_max: Force of action 1 of each rotor, (4,), N.
         actions: Output, (n, 4) float32.
         new_counts: Output, (n, 5).
         new_worst: Output, (n,).
+        new_left: Output, (n,).
     """
     for j in range(commands.shape[0]):
         for i in range(4):
@@ -111,6 +117,7 @@ def encode_commands(
             new_counts[j, i] = 0 if start[j] else counts[j, i]
         new_counts[j, fallback[j]] += 1
         new_worst[j] = iterations[j] if start[j] else max(iterations[j], worst[j])
+        new_left[j] = left[j] + (0 if start[j] else times_left[j])
 
 
 class ControllerPolicy:
@@ -157,20 +164,24 @@ class ControllerPolicy:
         decision = self.controller.decide(plants, windows, lasts, disturbances, memory)
         actions = np.empty((n, 4), dtype=np.float32)
         counts, worst = np.empty((n, N_FALLBACKS), dtype=np.int64), np.empty(n, dtype=np.int64)
+        left = np.empty(n, dtype=np.int64)
         encode_commands(
             decision.command,
             decision.fallback,
             decision.iterations,
+            _zeros(n) if decision.left_model is None else decision.left_model,
             start,
             state.fallbacks,
             state.worst_iterations,
+            times_left(state),
             self._hover,
             self._force_max,
             actions,
             counts,
             worst,
+            left,
         )
-        kept = PolicyState(decision.memory, counts, decision.iterations, worst)
+        kept = PolicyState(decision.memory, counts, decision.iterations, worst, left_model=left)
         return actions[0] if one else actions, kept
 
 

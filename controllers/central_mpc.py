@@ -33,7 +33,7 @@ from .controller import PLANT_SIZE, Decision, as_array
 from .fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, limit_command
 from .model import sdc_pair
 from .mpc import MpcOptions, mpc_data
-from .mpc_kernels import add_rotor_lag
+from .mpc_kernels import add_rotor_lag, left_model
 from .ocp import Condensed, OcpQp, condense, no_rows
 from .solvers.structured import ITERATION_LIMIT
 
@@ -131,6 +131,7 @@ class CentralMpc:
             "osqp", "heading", "attitude", soft_weight, margin, False, "auto", ITERATION_LIMIT
         )
         self._data = mpc_data(task, self.horizon, options)
+        self._validity = self._data.model_tilt, self._data.first_angle
         self._pairs = np.stack(np.triu_indices(task.vehicles, 1), axis=-1)
         n, N, K = task.vehicles, self.horizon, len(self._data.normal)
         self._per_pair = N + (braking_time > 0.0)
@@ -188,7 +189,11 @@ class CentralMpc:
         inputs = (forces - hover).reshape(n, N * N_INPUT)
         positions = [(part.S @ inputs[i] + part.f)[1:, POSITION] for i, part in enumerate(condensed)]
         memory = np.concatenate([[float(level <= PREVIOUS_PLAN)], forces.ravel(), np.ravel(positions)])
-        return Decision(command, memory, np.full(n, level), np.full(n, iterations))
+        left = [
+            left_model(level, part.f[0], part.S @ inputs[i] + part.f, part.f[:1], *self._validity)
+            for i, part in enumerate(condensed)
+        ]
+        return Decision(command, memory, np.full(n, level), np.full(n, iterations), np.array(left, np.int64))
 
     def _checked(self, *arguments: ArrayLike) -> list[Array]:
         """The arguments as arrays, in the right shapes and finite."""

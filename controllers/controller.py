@@ -28,6 +28,7 @@ class Decision(NamedTuple):
     memory: Array  # (n, memory_size), opaque: pass it to the next decide
     fallback: IntArray  # (n,), Fallback: how each command was found
     iterations: IntArray  # (n,), active-set iterations
+    left_model: IntArray | None = None  # (n,), 1 where its state or plan left where the model holds; None: 0
 
 
 class Controller(Protocol):

@@ -16,7 +16,17 @@ from .controller import all_finite
 from .fallback import HOVER, PREVIOUS_PLAN
 from .linalg import copy
 from .model import sdc_matrix, zero_order_hold
-from .mpc_kernels import MpcData, Scratch, begin_row, carve, end_row, hold_trim, solve_row
+from .mpc_kernels import (
+    MpcData,
+    Scratch,
+    begin_row,
+    carve,
+    copy_vector,
+    end_row,
+    hold_trim,
+    left_model,
+    solve_row,
+)
 from .ocp import IntArray
 from .solvers.structured import Workspace
 
@@ -144,6 +154,7 @@ def pose_row(
         for b in range(3):
             s.A_c[a, 6 + b] += D[a, b]
     zero_order_hold(s.A_c, data.B_c, data.dt, s.A[0], s.B[0], s.square)
+    copy_vector(s.x_0, s.points[0])
     hold_trim(s.A, s.trim, s.c)
     hold_attitude(s.x_0, D, data.dt, s.c)
     if layout.stage_weight:
@@ -214,5 +225,6 @@ def decide_team(
         )
         start = kept.shape[1] - N_PLAN_STAGE * N
         _write_plan(level, plant, ws.x, memory[start:], data.dt, kept[j, start:])
-        report[0, j], report[1, j] = level, iterations
+        left = left_model(level, s.x_0, ws.x, s.points, data.model_tilt, data.first_angle)
+        report[0, j], report[1, j], report[2, j] = level, iterations, left
     return bad

@@ -44,6 +44,7 @@ class CooperativeDecision(NamedTuple):
     memory: Array  # (n, memory_size), opaque: pass it to the next decide
     fallback: IntArray  # (n,), Fallback: how each command was found
     iterations: IntArray  # (n,), active-set iterations
+    left_model: IntArray  # (n,), 1 where its state or plan left where the model holds
     plan: Array  # (n, N, 6), p and v predicted for k+1..k+N, inertial, p relative to the present position
 
 
@@ -220,7 +221,7 @@ class CooperativeMpc:
         team = self._as_team(arguments)
         n, N = len(team[0]), self.horizon
         command, kept = np.empty((n, N_INPUT)), np.empty((n, self.memory_size))
-        report = np.empty((2, n), np.int64)
+        report = np.empty((3, n), np.int64)
         which, *scratch = self._scratch()
         bad = decide_team(team, command, kept, report, which, *self._constants, *scratch)
         if bad >= 0:
@@ -230,7 +231,7 @@ class CooperativeMpc:
             )
             raise ValueError(f"{NAMES[argument]} of vehicle {row} is not finite; {remedy}")
         plan = kept[:, -N_PLAN_STAGE * N :].reshape(n, N, N_PLAN_STAGE).copy()
-        return CooperativeDecision(command, kept, report[0], report[1], plan)
+        return CooperativeDecision(command, kept, report[0], report[1], report[2], plan)
 
     def problems(self, *arguments: ArrayLike | None) -> list[OcpQp]:
         """The OCP-QP of each vehicle, in its heading frame; arguments as of `decide`. For study and tests."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quad_envs._numba import kernel
-from quad_envs.parameters import Array
+from quad_envs.parameters import ATTITUDE, Array
 from quad_envs.tasks import Task
 
 from .controller import first_non_finite
@@ -24,7 +24,7 @@ from .mpc import (
     VelocityReference,
     default_tilt,
 )
-from .mpc_kernels import MpcData, Scratch, begin_row, carve, end_row, hold_trim, solve_within_tilt
+from .mpc_kernels import MpcData, Scratch, begin_row, carve, end_row, hold_trim, left_model, solve_within_tilt
 from .ocp import IntArray
 from .solvers.structured import ITERATION_LIMIT, Workspace
 
@@ -60,7 +60,8 @@ def _decide_rows(
         has_plan = memories[j, 0] > 0.0
         level, iterations = solve_within_tilt(A, B, data.Q, data.P, stationary, s.r, has_plan, data, s, ws)
         end_row(level, plants[j], lasts[j], disturbances[j], memories[j], data, s, ws.u, commands[j], kept[j])
-        report[0, j], report[1, j] = level, iterations
+        left = left_model(level, s.x_0, ws.x, s.points, data.model_tilt, data.first_angle)
+        report[0, j], report[1, j], report[2, j] = level, iterations, left
     return bad
 
 
@@ -128,6 +129,7 @@ class LinearMPC(Mpc):
             terminal,
         )
         super().__init__(task, horizon, options, pairs=1, guess=False)
+        self._data = self._data._replace(first_angle=ATTITUDE.start + 2)
         A, B = hover_pair(task.params, task.dt)
         self._A, self._B = np.ascontiguousarray(A[None]), np.ascontiguousarray(B[None])
 

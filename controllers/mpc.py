@@ -27,6 +27,7 @@ from .mpc_kernels import (
     carve,
     end_row,
     leaves_tilt,
+    left_model,
     rotor_lag,
 )
 from .ocp import IntArray, OcpQp, StateRows, concatenate_rows, no_rows, output_rows
@@ -190,6 +191,8 @@ def mpc_data(task: BaseTask, horizon: int, options: MpcOptions) -> MpcData:
         plan_tilt=float(options.plan_tilt) if len(tilted.normals) else math.inf,
         own_outputs=len(own.normals),
         own_rows=len(own.normal),
+        model_tilt=PLAN_TILT,
+        first_angle=ATTITUDE.start,
     )
 
 
@@ -234,7 +237,7 @@ class Mpc(ABC):
         command, kept, report = (
             np.empty((n, N_INPUT)),
             np.empty((n, self.memory_size)),
-            np.empty((2, n), np.int64),
+            np.empty((3, n), np.int64),
         )
         if self.options.solver == "structured":
             bad = self._decide_rows(*arrays, command, kept, report)
@@ -242,7 +245,7 @@ class Mpc(ABC):
             bad = self._decide_by_backend(*arrays, command, kept, report)
         if bad >= 0:
             raise_non_finite(bad)
-        return Decision(command, kept, report[0], report[1])
+        return Decision(command, kept, *report)
 
     def problem(
         self,
@@ -328,7 +331,9 @@ class Mpc(ABC):
                 kept[j],
             )
             self._keep(level, kept[j], s)
-            report[:, j] = level, iterations
+            points = s.points[: len(problem.A)]
+            tilt, first = self._data.model_tilt, self._data.first_angle
+            report[:, j] = level, iterations, left_model(level, s.x_0, ws.x, points, tilt, first)
         return -1
 
     def _solve(

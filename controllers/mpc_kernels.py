@@ -29,6 +29,8 @@ from .solvers.working_set import pack_working_set, unpack_working_set
 MEMORY_STAGE = N_INPUT + 1  # numbers that a plan and its working set take per stage
 
 
+FROZEN_SPAN = 0.5  # rad, of roll, pitch or yaw, for which the pair taken at a state still serves
+_ROOM = 1e-3  # rad beyond, which a solver may leave of an active row
 GOVERNOR_REACH = 6.0  # m: beyond the starts of every id; a linear model asked for 15 m flips the vehicle
 
 
@@ -59,6 +61,8 @@ class MpcData(NamedTuple):
     plan_tilt: float  # rad, of the plan's own rows, inf for none
     own_outputs: int  # outputs and rows of the task's limits, which stand first
     own_rows: int
+    model_tilt: float  # rad, roll and pitch up to which the model holds
+    first_angle: int  # of the state, of those that may not leave the point of the model: 6 (all) or 8 (yaw)
 
 
 class Scratch(NamedTuple):
@@ -89,6 +93,7 @@ class Scratch(NamedTuple):
     target: Array  # (M+1, 12), references that go with them
     X: Array  # (M+1, 12), guess of the states
     F: Array  # (M, 4), and of the rotor forces
+    points: Array  # (1 or N, 12), states at which the pairs were taken; hover: zeros
 
 
 def buffer_size(N: int, pairs: int, H: int, K: int, M: int) -> int:
@@ -96,7 +101,8 @@ def buffer_size(N: int, pairs: int, H: int, K: int, M: int) -> int:
     n, m = N_STATE, N_INPUT
     vectors = 2 * n + 4 * m + 2 * N_DISTURBANCE + ESTIMATOR_SCRATCH
     stages = n * (2 * N + 1) + pairs * n * (n + m) + n * H + 3 * K
-    return vectors + N + stages + (2 + DARE_SCRATCH) * n * n + M * n * n + 2 * n * (M + 1) + m * M
+    guess = M * n * n + 2 * n * (M + 1) + m * M
+    return vectors + N + stages + (2 + DARE_SCRATCH) * n * n + guess + pairs * n
 
 
 @kernel
@@ -139,13 +145,15 @@ def carve(buffer: Array, N: int, pairs: int, H: int, K: int, M: int) -> Scratch:
     target = _take(buffer, i, M + 1, n)
     i += target.size
     X = _take(buffer, i, M + 1, n)
-    F = _take(buffer, i + X.size, M, m)
+    i += X.size
+    F = _take(buffer, i, M, m)
+    points = _take(buffer, i + F.size, pairs, n)
     o = 2 * n + 4 * m
     return Scratch(
         v[:n], v[n : 2 * n], v[2 * n : 2 * n + m], v[2 * n + m : 2 * n + 2 * m],
         v[2 * n + 2 * m : 2 * n + 3 * m], v[2 * n + 3 * m : o], v[o : o + e], v[o + e : o + 2 * e],
         r, c, A, B, normals, rows[0], rows[1], rows[2], square[0], square[1], square[2:], v[o + 2 * e :],
-        working, Q, target, X, F,
+        working, Q, target, X, F, points,
     )  # fmt: skip
 
 
@@ -464,6 +472,35 @@ def solve_within_tilt(
         again, count = solve_row(A, B, Q, Q_f, stationary, r, has_plan, H, K, data, s, ws)
         level, iterations = max(level, again), iterations + count
     return level, iterations
+
+
+@kernel
+def left_model(level: int, x_0: Array, x: Array, points: Array, model_tilt: float, first_angle: int) -> bool:
+    """Whether the state or the plan of a decision is where the model does not hold.
+
+    That is: roll or pitch beyond `model_tilt`, or (stages 1 to N) an Euler angle more than FROZEN_SPAN from
+    the state at which the pair of the stage was taken. Without a plan of its own (PREVIOUS_PLAN, HOVER) a
+    decision has its state alone.
+
+    Args:
+        level: Fallback.
+        x_0: State, (12,).
+        x: Plan, (N+1, 12).
+        points: Where the pairs were taken, (1 or N, 12).
+        model_tilt: rad.
+        first_angle: First of the states that are compared with those points, 6, or 8 for yaw alone.
+    """
+    tilt, span = model_tilt + _ROOM, FROZEN_SPAN + _ROOM
+    if abs(x_0[6]) > tilt or abs(x_0[7]) > tilt:
+        return True
+    if level == PREVIOUS_PLAN or level == HOVER:
+        return False
+    for i in range(1, x.shape[0]):
+        point = points[min(i, points.shape[0] - 1)]
+        for a in range(first_angle, 9):
+            if abs(x[i, a] - point[a]) > span:
+                return True
+    return leaves_tilt(x, tilt)
 
 
 @kernel

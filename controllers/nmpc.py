@@ -31,7 +31,16 @@ from .mpc import (
     default_tilt,
     require_choice,
 )
-from .mpc_kernels import MpcData, Scratch, begin_row, carve, copy_vector, end_row, solve_within_tilt
+from .mpc_kernels import (
+    MpcData,
+    Scratch,
+    begin_row,
+    carve,
+    copy_vector,
+    end_row,
+    left_model,
+    solve_within_tilt,
+)
 from .ocp import IntArray
 from .solvers.structured import ITERATION_LIMIT, Workspace
 
@@ -87,6 +96,7 @@ def linearise_model(data: MpcData, s: Scratch) -> None:
     for i in range(s.F.shape[0]):
         copy_vector(s.X[i], point)
         point[7] = min(max(point[7], -_PITCH_LIMIT), _PITCH_LIMIT)
+        copy_vector(point, s.points[i])
         rk4_sensitivities(
             point, s.F[i], s.d, data.coefficients, data.B_c, data.dt, x_next, s.A[i], s.B[i], scratch
         )
@@ -257,7 +267,8 @@ def _decide_rows(
                 break
         end_row(worst, plants[j], lasts[j], disturbances[j], memories[j], data, s, ws.u, commands[j], kept[j])
         keep_guess(worst <= RELAXED, s.X, kept[j, keep_from:])
-        report[0, j], report[1, j] = worst, iterations
+        left = left_model(worst, s.x_0, ws.x, s.points, data.model_tilt, data.first_angle)
+        report[0, j], report[1, j], report[2, j] = worst, iterations, left
     return bad
 
 
@@ -316,6 +327,7 @@ class ExactNmpc(Mpc):
             iteration_limit, Q, R, default_tilt(plan_tilt, EXACT_TILT, frame), terminal,
         )  # fmt: skip
         super().__init__(task, horizon, options, pairs=horizon, guess=True)
+        self._data = self._data._replace(model_tilt=EXACT_TILT)
         self.passes = int(passes)
         self.velocity_error = velocity_error
 

@@ -28,6 +28,7 @@ from .mpc import (
     require_choice,
 )
 from .mpc_kernels import (
+    FROZEN_SPAN,
     MpcData,
     Scratch,
     begin_row,
@@ -35,6 +36,7 @@ from .mpc_kernels import (
     copy_vector,
     end_row,
     hold_trim,
+    left_model,
     solve_within_tilt,
 )
 from .ocp import IntArray
@@ -42,7 +44,6 @@ from .riccati import solve_dare
 from .solvers.structured import ITERATION_LIMIT, Workspace
 
 TerminalWeight = Literal["hover", "sdre"]
-FROZEN_SPAN = 0.5  # rad, of roll, pitch or yaw along a plan, for which the pair at its start still serves
 _TILT_LIMIT = 1.4  # rad, of roll and pitch of the states at which the model is taken again
 
 
@@ -79,6 +80,7 @@ def freeze_model(alpha: float, sdre_weight: bool, data: MpcData, s: Scratch) -> 
     """
     sdc_matrix(s.x_0, alpha, data.coefficients, s.A_c)
     zero_order_hold(s.A_c, data.B_c, data.dt, s.A[0], s.B[0], s.square)
+    copy_vector(s.x_0, s.points[0])
     hold_trim(s.A[:1], s.trim, s.c)
     for i in range(s.c.shape[0]):
         hold_heading(s.r[i], s.x_0, s.A_c, data.dt, s.c[i])
@@ -94,6 +96,7 @@ def relinearise(u: Array, alpha: float, data: MpcData, s: Scratch) -> None:
     x, x_next = s.square[3, 0], s.square[3, 1]
     copy_vector(s.x_0, x)
     for i in range(u.shape[0]):
+        copy_vector(x, s.points[i])
         yaw = x[8]
         x[8] -= s.r[i, 8] - s.r[0, 8]  # velocities do not turn with the heading of the reference
         sdc_matrix(x, alpha, data.coefficients, s.A_c)
@@ -167,7 +170,8 @@ def _decide_rows(
             if level > RELAXED or (at_need and not leaves_pair(ws.x)):
                 break
         end_row(worst, plants[j], lasts[j], disturbances[j], memories[j], data, s, ws.u, commands[j], kept[j])
-        report[0, j], report[1, j] = worst, iterations
+        left = left_model(worst, s.x_0, ws.x, s.points[:pairs], data.model_tilt, data.first_angle)
+        report[0, j], report[1, j], report[2, j] = worst, iterations, left
     return bad
 
 

@@ -53,6 +53,7 @@ _END = (
     ("team_p50_ms", "Team p50", "ms", "the same for the whole team", -1, "number"),
     ("team_p99_ms", "Team p99", "ms", "its 99th percentile", -1, "number"),
     ("fallbacks", "Fallbacks", "", "decisions without the solver's own answer", -1, "count"),
+    ("left_model", "Left model", "", "decisions outside where the policy's model holds", -1, "count"),
 )
 
 

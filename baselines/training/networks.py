@@ -290,6 +290,7 @@ class NetworkPolicy:
 def _no_state(n: int) -> PolicyState:
     """The state of a policy that remembers nothing, shared by its calls and so read-only."""
     state = state_of(None, n, 0)
-    for part in (state.memory, state.fallbacks, state.iterations, state.worst_iterations):
+    for part in (state.memory, state.fallbacks, state.iterations, state.worst_iterations, state.left_model):
+        assert part is not None
         part.setflags(write=False)
     return state
