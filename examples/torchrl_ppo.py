@@ -3,8 +3,8 @@
     python -m examples.torchrl_ppo [--updates 20]
 
 TorchRL prefers vector environments that reset nothing themselves: `autoreset_mode="Disabled"`;
-"SameStep" works, too, Gymnasium's default "NextStep" it refuses. Its reader of infos takes arrays, so
-it reads those of vector ones.
+"SameStep" works, too, Gymnasium's default "NextStep" it refuses. Its reader of infos takes arrays, which
+vector environments have and `quad_envs.ArrayInfo` makes of a single one's numbers.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 import quad_envs  # noqa: F401  registers the ids
-from quad_envs import formation_v0
+from quad_envs import ArrayInfo, formation_v0
 
 HELIX = "quad/HelixTracking-v0"
 
@@ -30,6 +30,10 @@ def check():
     single = GymEnv(HELIX)
     check_env_specs(single)
     print("GymEnv:", single.rollout(200)["next", "reward"].shape)
+
+    told = GymWrapper(ArrayInfo(gym.make(HELIX))).auto_register_info_dict()
+    check_env_specs(told)
+    print("ArrayInfo: stage cost", float(told.rollout(200)["next", "stage_cost"].mean()))
 
     many = GymWrapper(gym.make_vec(HELIX, num_envs=64, autoreset_mode="Disabled")).auto_register_info_dict()
     check_env_specs(many)

@@ -9,6 +9,7 @@ from .lazy import load_public, public_names
 from .registration import TEAMS, register
 
 if TYPE_CHECKING:
+    from .array_info import ArrayInfo
     from .disturbances import Gusts, Impulse, Steady, TorquePulse
     from .formations import make_formation
     from .graphs import Switching, Timed, adjacency, make_graph, toward_leader
@@ -43,6 +44,7 @@ __version__ = "0.1.0"
 # Public name -> module; loaded at first use, so that importing the package stays cheap.
 _PUBLIC = {
     "Aircraft": "targets",
+    "ArrayInfo": "array_info",
     "ConstantVelocity": "targets",
     "Gusts": "disturbances",
     "Heading": "references",
@@ -82,6 +84,7 @@ _TEAM_MODULES = [module.rpartition(".")[2] for module in TEAMS.values()]
 
 __all__ = [
     "Aircraft",
+    "ArrayInfo",
     "ConstantVelocity",
     "Gusts",
     "Heading",
