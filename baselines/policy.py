@@ -85,6 +85,9 @@ class Policy(Protocol):
         Returns:
             Actions (n, a) float32 in [-1, 1], or (a,) for an observation (d,), and the state to pass on; a is
             4 for one vehicle and `task.action_size` for a team.
+
+        Raises:
+            ValueError: If a shape is wrong, or a number of any row is not finite: then no row is decided.
         """
         ...
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from quad_envs.parameters import Array
 from quad_envs.tasks import BaseTask, TeamTask
 
 from .checks import require_whole
+from .deciding import decide
 from .environments import is_parallel, require_own_task
 from .episode import INFO, Episode, Recorder, Said
 from .pairing import require_pair
@@ -55,7 +55,8 @@ def run_episodes(
     Raises:
         ValueError: If episodes < 1, the seed < 0, the environment is not of this suite, the policy was made
             for another task, a wrapper changes the numbers that it reads or writes, a vector environment
-            resets in the same step, or a privileged policy cannot see the truth.
+            resets in the same step, or a privileged policy cannot see the truth. In flight if an observation
+            or an action is not finite, with the row, its seed and the step.
     """
     require_whole("episodes", episodes, 1)
     require_whole("seed", seed, 0)
@@ -81,12 +82,10 @@ def _single_episodes(policy: Policy, env: Any, episodes: int, seed: int) -> Iter
         observation, _ = env.reset(seed=seed + i)
         recorder = Recorder(task, [seed + i], plain.reference[None], plain.state[None])
         if i == 0:
-            _warm_up(policy, observation[None])
+            _warm_up(policy, observation[None], recorder)
         state, start = None, np.ones(1, dtype=np.bool_)
         while recorder.live[0]:
-            begin = perf_counter()
-            actions, state = policy.predict(observation[None], state, start, deterministic=True)
-            seconds = perf_counter() - begin
+            actions, state, seconds = decide(policy, observation[None], state, start, recorder)
             seen = observation[None]
             observation, reward, terminated, truncated, said = env.step(actions[0])
             info = {key: np.asarray(said[key])[None] for key in INFO}
@@ -119,7 +118,7 @@ def _vector_episodes(policy: Policy, env: Any, episodes: int, seed: int) -> Iter
         state, start = None, np.ones(n, dtype=np.bool_)
         while recorder.live[:wanted].any():
             live = recorder.live[:, None].copy()
-            actions, state = policy.predict(observations, state, start, deterministic=True)
+            actions, state, _ = decide(policy, observations, state, start, recorder)
             seen, *told = env.step(np.where(live, actions, np.float32(0.0)))
             recorder.add(observations, state, actions, Said(*told), np.nan, _plants(plain, n))
             observations = np.where(recorder.live[:, None], seen, observations)
@@ -150,13 +149,12 @@ def _parallel_episodes(policy: Policy, env: Any, episodes: int, seed: int) -> It
         observations = np.stack([seen[name] for name in names])
         recorder = _parallel_recorder(env, seed + i, names)
         if i == 0:
-            _warm_up(policy, _shown(policy, env, observations))
+            _warm_up(policy, _shown(policy, env, observations), recorder)
         state, first, last = None, True, None
         while env.agents:
             shown = _shown(policy, env, observations)
-            begin = perf_counter()
-            actions, state = policy.predict(shown, state, np.full(len(shown), first), deterministic=True)
-            seconds = (perf_counter() - begin) / len(names)
+            actions, state, taken = decide(policy, shown, state, np.full(len(shown), first), recorder)
+            seconds = taken / len(names)
             actions = actions[0] if is_privileged(policy) else actions
             step = env.step({name: actions[j] for j, name in enumerate(names) if name in env.agents})
             last = _stack_step(names, step[1:], last)
@@ -210,9 +208,9 @@ def _plants(plain: Any, n: int) -> Array:
     return np.array(found, dtype=np.float64)
 
 
-def _warm_up(policy: Policy, observations: NDArray[Any]) -> None:
+def _warm_up(policy: Policy, observations: NDArray[Any], recorder: Recorder) -> None:
     """Compile before the clock runs; the result is dropped."""
     state, start = None, np.ones(len(observations), dtype=np.bool_)
     for _ in range(_WARM_UP_CALLS):
-        _, state = policy.predict(observations, state, start, deterministic=True)
+        _, state, _ = decide(policy, observations, state, start, recorder)
         start = np.zeros(len(observations), dtype=np.bool_)
