@@ -10,12 +10,13 @@ if TYPE_CHECKING:
     from .benchmark import run_benchmark
     from .comparison import Results
     from .conformance import check_policy
-    from .errors import CheckpointError, PolicyCheckError, ResultsError, TrainingError
+    from .errors import CheckpointError, PolicyCheckError, PolicyError, ResultsError, TrainingError
     from .estimate_wrapper import EstimateWrapper
-    from .evaluation import Evaluation, evaluate
+    from .evaluation import Evaluation
     from .metrics import Estimate, Record, estimate, measure, paired_difference
     from .policy import Policy, PolicyState, make_policy, policy_options
     from .rollout import Episode, run_episodes
+    from .single import evaluate
     from .suite import Suite
     from .suite_files import load_suite
     from .trained import load_policy, shipped_policies
@@ -30,6 +31,7 @@ _PUBLIC = {
     "Evaluation": "evaluation",
     "Policy": "policy",
     "PolicyCheckError": "errors",
+    "PolicyError": "errors",
     "PolicyState": "policy",
     "Record": "metrics",
     "Results": "comparison",
@@ -39,7 +41,7 @@ _PUBLIC = {
     "TrainingResult": "training.runs",
     "check_policy": "conformance",
     "estimate": "metrics",
-    "evaluate": "evaluation",
+    "evaluate": "single",
     "load_policy": "trained",
     "load_suite": "suite_files",
     "make_policy": "policy",
@@ -60,6 +62,7 @@ __all__ = [
     "Evaluation",
     "Policy",
     "PolicyCheckError",
+    "PolicyError",
     "PolicyState",
     "Record",
     "Results",

@@ -120,7 +120,10 @@ def make_parser() -> Parser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; the exit code: 0, or 2 if the input was bad, 130 if interrupted."""
+    """Run one command; the exit code: 0, or 2 if the input was bad, 130 if interrupted.
+
+    Modules of the current folder can be named, as `mypolicy:make`.
+    """
     given = list(sys.argv[1:] if arguments is None else arguments)
     parser = make_parser()
     if given and not given[0].startswith("-") and given[0] not in COMMANDS:
@@ -130,7 +133,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     found, rest = parser.parse_known_args(given)
     command = COMMANDS[found.command]
     refuse_unknown(rest, command.options, parser)
-    with _quiet_pipe():
+    with _quiet_pipe(), _importable_here():
         try:
             return command.run(read_options(command.options, found))
         except BrokenPipeError:
@@ -174,6 +177,21 @@ def _quiet_pipe() -> Iterator[None]:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(_BROKEN_PIPE) from None
+
+
+@contextmanager
+def _importable_here() -> Iterator[None]:
+    """Let modules of the current folder be imported, as `python -m` does."""
+    here = os.getcwd()
+    if here in sys.path or "" in sys.path or getattr(sys.flags, "safe_path", False):
+        yield
+        return
+    sys.path.insert(0, here)
+    try:
+        yield
+    finally:
+        if here in sys.path:
+            sys.path.remove(here)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,8 @@ from quad_envs.names import unknown_name
 
 from .options import BenchmarkOptions, EvaluateOptions, ListOptions, read_assignments
 
+_FAILED = 1  # a policy from outside broke off
+
 # What the multi-agent environments are, for `list`, which loads none of them.
 TEAM_KINDS = {
     "quad/Formation-v0": "formation: quadrotors take and keep their slots behind a leader",
@@ -62,6 +64,7 @@ def list_names(options: ListOptions) -> int:
     from quad_envs.registration import TRACKING
     from quad_envs.vehicles import VEHICLES
 
+    from .outside import installed_policies
     from .policy import TEAM_POLICIES, TRACKING_POLICIES
     from .suite_files import suite_names
     from .trained import shipped_policies
@@ -86,6 +89,7 @@ def list_names(options: ListOptions) -> int:
                     "policies": policies,
                     "team_policies": team,
                     "trained_policies": shipped_policies(),
+                    "installed_policies": installed_policies(),
                     "suites": suite_names(),
                 },
                 indent=1,
@@ -103,8 +107,11 @@ def list_names(options: ListOptions) -> int:
         ("policies for one vehicle", policies),
         ("policies for several vehicles", team),
         ("trained policies", shipped_policies() or {"-": "none; quad-envs train ENV ALGORITHM makes one"}),
+        ("policies of other packages", installed_policies()),
         ("suites", suite_names()),
     ):
+        if not entries:
+            continue
         print(title)
         for name, text in entries.items():
             print(f"  {name:28} {text}")
@@ -117,9 +124,10 @@ def _list_options(options: ListOptions) -> int:
 
     from quad_envs.registration import TEAMS, TRACKING
 
-    from .policy import TEAM_POLICIES, TRACKING_POLICIES, policy_options
+    from .outside import installed_policies
+    from .policy import TEAM_POLICIES, TRACKING_POLICIES, from_outside, policy_options
 
-    names = [*TRACKING, *TEAMS, *TRACKING_POLICIES, *TEAM_POLICIES]
+    names = [*TRACKING, *TEAMS, *TRACKING_POLICIES, *TEAM_POLICIES, *installed_policies()]
     if options.name in (*TRACKING, *TEAMS):
         if options.name in TEAMS:
             kind = import_module(TEAMS[options.name]).raw_env.options_type
@@ -129,7 +137,7 @@ def _list_options(options: ListOptions) -> int:
         values |= TRACKING.get(options.name, {})
         del values["env_id"]
         flag = "--set"
-    elif options.name in names:
+    elif options.name in names or from_outside(options.name):
         values, flag = policy_options(options.name), "--policy-set"
     else:
         raise ValueError(unknown_name("name", options.name, names))
@@ -146,8 +154,8 @@ def evaluate_one(options: EvaluateOptions) -> int:
     """Fly one policy in one environment and print the numbers."""
     from .benchmark import run_benchmark
     from .environments import make_env
-    from .evaluation import evaluate
-    from .policy import make_policy
+    from .evaluation import fly_and_measure
+    from .policy import make_policy, policy_name
     from .suite import EnvChoice, PolicyChoice, Suite
 
     env_kwargs = read_assignments("--set", options.set)
@@ -170,7 +178,8 @@ def evaluate_one(options: EvaluateOptions) -> int:
         policy = make_policy(options.policy, env, **policy_kwargs)
         with progress(options.episodes, "flight") as bar:
             count = lambda episode: bar.update(episode.seed - options.seed + 1 - bar.n)  # noqa: E731
-            found = evaluate(policy, env, options.episodes, options.seed, on_episode=count)
+            found = fly_and_measure(policy, env, options.episodes, options.seed, on_episode=count)
+        found = replace(found, policy=policy_name(policy, options.policy))
     print(json.dumps(found.to_dict(), indent=1, allow_nan=False) if options.json else found)
     return 0
 
@@ -178,6 +187,7 @@ def evaluate_one(options: EvaluateOptions) -> int:
 def benchmark_suite(options: BenchmarkOptions) -> int:
     """Fly a suite, print its tables, and leave a results folder."""
     from .benchmark import run_benchmark
+    from .suite import PolicyChoice
     from .suite_files import load_suite
     from .units import suite_units, training_units
 
@@ -186,6 +196,7 @@ def benchmark_suite(options: BenchmarkOptions) -> int:
         name: getattr(options, name) for name in ("episodes", "seed") if getattr(options, name) is not None
     }
     suite = replace(suite.quick() if options.quick else suite, **changes)
+    suite = replace(suite, policies=(*suite.policies, *map(PolicyChoice, options.policy)))
     out = options.out or Path("runs") / f"{suite.name}-{datetime.now():%Y%m%d-%H%M%S}"
     finished = 0
     with progress(len(training_units(suite)) + len(suite_units(suite)), "unit") as bar, plain_warnings():
@@ -212,7 +223,7 @@ def benchmark_suite(options: BenchmarkOptions) -> int:
             return 130
     print(json.dumps(results.to_dict(), indent=1, allow_nan=False) if options.json else results)
     _say_where(out)
-    return 0
+    return _FAILED if results.failures else 0
 
 
 def _say_where(out: Path) -> None:
@@ -225,6 +236,7 @@ def _resume(options: BenchmarkOptions, out: Path) -> str:
     for name in ("episodes", "seed"):
         value = getattr(options, name)
         words += [] if value is None else [f"--{name} {value}"]
+    words += [f"--policy {shlex.quote(name)}" for name in options.policy]
     words += [f"--engine {options.engine}"] if options.engine != "processes" else []
     words += [f"--jobs {options.jobs}"] if options.jobs != 1 else []
     words += ["--quick"] if options.quick else []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from .contenders import contender_rows, contender_tables, find_contenders
 from .evaluation import NO_SPANNING_TREE, Evaluation
@@ -49,37 +49,51 @@ _LAST_COLUMNS = (
 )
 
 
+class Failure(NamedTuple):
+    """A policy from outside that did not fly in an environment."""
+
+    env: str  # title
+    policy: str  # title
+    message: str  # names the policy and the line of its file
+
+
 @dataclass(frozen=True, slots=True)
 class Results:
     """What `run_benchmark` found; prints as one table per environment."""
 
     suite: Suite
-    evaluations: tuple[Evaluation, ...]  # one per unit of `suite_units`
+    evaluations: tuple[Evaluation, ...]  # one per unit of `flown`
     trainings: tuple[Mapping[str, Any], ...] = ()  # one per network that was trained, see `training_units`
+    failures: tuple[Failure, ...] = ()
+
+    def flown(self) -> list[Unit]:
+        """Units of the suite but those that failed."""
+        failed = {(one.env, one.policy) for one in self.failures}
+        return [unit for unit in suite_units(self.suite) if (unit.env.title, unit.policy.title) not in failed]
 
     def get(self, env: str, policy: str) -> Evaluation:
         """The evaluation of a policy in an environment, by their titles."""
-        for unit, evaluation in zip(suite_units(self.suite), self.evaluations, strict=True):
+        for unit, evaluation in zip(self.flown(), self.evaluations, strict=True):
             if (unit.env.title, unit.policy.title) == (env, policy):
                 return evaluation
-        raise KeyError(f"no evaluation of {policy!r} in {env!r}")
+        why = [f": {one.message}" for one in self.failures if (one.env, one.policy) == (env, policy)]
+        raise KeyError(f"no evaluation of {policy!r} in {env!r}{''.join(why)}")
 
     def rows(self) -> list[dict[str, Any]]:
         """One row per environment x policy x flight, of a team one per vehicle (column agent)."""
-        units = suite_units(self.suite)
         return [
             {"env": unit.env.title, "policy": unit.policy.title, **record.row()}
-            for unit, evaluation in zip(units, self.evaluations, strict=True)
+            for unit, evaluation in zip(self.flown(), self.evaluations, strict=True)
             for record in evaluation.records
         ]
 
     def summary(self) -> list[dict[str, Any]]:
         """One row per environment x policy: means, half widths (_ci), paired differences (_minus_base)."""
-        return [self._summary_row(unit) for unit in suite_units(self.suite)]
+        return [self._summary_row(unit) for unit in self.flown()]
 
     def base_of(self, env: str) -> str:
         """Title of the policy from which differences are taken: the suite's, else the first flown there."""
-        flown = [unit.policy.title for unit in suite_units(self.suite) if unit.env.title == env]
+        flown = [unit.policy.title for unit in self.flown() if unit.env.title == env]
         return self.suite.base if self.suite.base in flown else flown[0]
 
     def _summary_row(self, unit: Unit) -> dict[str, Any]:
@@ -112,7 +126,7 @@ class Results:
     def contender_rows(self) -> list[dict[str, Any]]:
         """One row per environment x contender, where all training seeds of an algorithm are one contender."""
         names = {policy.title: policy.contender for policy in self.suite.policies}
-        contenders = find_contenders(self.suite, self.evaluations, self.trainings)
+        contenders = find_contenders(self.suite, self.flown(), self.evaluations, self.trainings)
         return contender_rows(contenders, names[self.suite.base])
 
     def to_dict(self) -> dict[str, Any]:
@@ -120,16 +134,19 @@ class Results:
         found: dict[str, Any] = {
             "suite": self.suite.to_dict(),
             "evaluations": [one.to_dict() for one in self.evaluations],
+            "failures": [one._asdict() for one in self.failures],
         }
         if self.suite.learned:
             found |= {"contenders": plain_json(self.contender_rows()), "trainings": self.trainings}
         return found
 
     def __str__(self) -> str:
+        failures = [f"{one.policy} did not fly in {one.env}: {one.message}" for one in self.failures]
         if self.suite.learned:
-            return contender_tables(self.contender_rows())
-        flown = [one for env in self.suite.envs for one in self.suite.flown(env).values()]
-        return "\n\n".join(map(self._table, flown))
+            return "\n\n".join([contender_tables(self.contender_rows()), *failures])
+        flown = dict.fromkeys(unit.env.title for unit in self.flown())
+        envs = [one for env in self.suite.envs for one in self.suite.flown(env).values()]
+        return "\n\n".join([*(self._table(env) for env in envs if env.title in flown), *failures])
 
     def _table(self, env: EnvChoice) -> str:
         rows = [row for row in self.summary() if row["env"] == env.title]

@@ -21,7 +21,7 @@ from .suite import PolicyChoice, Suite, is_for
 from .table import format_number, format_table
 from .team_metrics import flight_values
 from .training.algorithms import ALGORITHMS
-from .units import suite_units, training_units
+from .units import Unit, training_units
 
 ALL = "all environments"
 _MEANS = ("cost", "position_rms", "steady_rms", "effort", "violation_share", "saturation_share")
@@ -76,19 +76,20 @@ class Contender(NamedTuple):
 
 
 def find_contenders(
-    suite: Suite, evaluations: Sequence[Evaluation], trainings: Sequence[Mapping[str, Any]]
+    suite: Suite,
+    units: Sequence[Unit],
+    evaluations: Sequence[Evaluation],
+    trainings: Sequence[Mapping[str, Any]],
 ) -> list[Contender]:
-    """All contenders of a suite, in its order.
+    """All contenders of a suite that flew, in its order.
 
     Args:
         suite: The suite.
-        evaluations: One per unit of `suite_units`.
+        units: That were flown.
+        evaluations: One per unit.
         trainings: One per unit of `training_units`.
     """
-    flights = {
-        (unit.env.title, unit.policy.title): one
-        for unit, one in zip(suite_units(suite), evaluations, strict=True)
-    }
+    flights = {(unit.env.title, unit.policy.title): one for unit, one in zip(units, evaluations, strict=True)}
     trained = {
         (unit.env.title, unit.policy.title): one
         for unit, one in zip(training_units(suite), trainings, strict=True)
@@ -101,6 +102,8 @@ def find_contenders(
                 groups.setdefault(policy.contender, []).append(policy)
         for condition, flown in suite.flown(env).items():
             for name, policies in groups.items():
+                if any((flown.title, policy.title) not in flights for policy in policies):
+                    continue
                 one = tuple(flights[flown.title, policy.title] for policy in policies)
                 costs = [trained[env.title, policy.title] for policy in policies if policy.train is not None]
                 found.append(Contender(env.title, condition, name, _kind(policies[0]), one, tuple(costs)))

@@ -1,4 +1,4 @@
-"""A decision in a flight: timed, and if it fails for numbers that are not finite, where that was."""
+"""A decision in a flight: timed and checked; what goes wrong is said with policy, start and step."""
 
 from __future__ import annotations
 
@@ -8,8 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_envs.tasks import TeamTask
+
+from .blame import place_of, place_where_defined, told
 from .episode import Recorder
-from .policy import Policy
+from .errors import PolicyError
+from .policy import Policy, policy_name
+
+_SUITE = ("baselines", "controllers", "quad_envs")  # whose errors say all there is to say
 
 
 class Decided(NamedTuple):
@@ -37,21 +43,40 @@ def decide(
     Raises:
         ValueError: If it refused, or answered with, numbers that are not finite: with the policy, the row,
             its seed and the step.
+        PolicyError: If the answer is not (actions, state) with actions of the right shape, or if a policy
+            from outside raised anything else: with the line of its file, the seed and the step.
     """
     begin = perf_counter()
     try:
-        actions, kept = policy.predict(observations, state, start, deterministic=True)
-    except ValueError as error:
+        answer = policy.predict(observations, state, start, deterministic=True)
+    except (Exception, SystemExit) as error:
         row = _first_row(observations)
-        if row is None:
+        if row is not None and isinstance(error, ValueError):
+            raise ValueError(f"{_place(policy, recorder, row)}: {error}") from error
+        if type(policy).__module__.partition(".")[0] in _SUITE:
             raise
-        raise ValueError(f"{_place(policy, recorder, row)}: {error}") from error
+        raise _broken(policy, recorder, told(error), place_of(error)) from error
     seconds = perf_counter() - begin
+    if not isinstance(answer, tuple) or len(answer) != 2:
+        raise _broken(policy, recorder, f"predict must return (actions, state), got {_kind(answer)}")
+    actions = np.asarray(answer[0])
+    wanted = _shape(policy, observations, recorder)
+    if actions.shape != wanted or actions.dtype.kind not in "fiu":
+        seen = f"for observations of shape {np.shape(observations)}"
+        raise _broken(policy, recorder, f"actions must have shape {wanted} {seen}, got {_kind(answer[0])}")
     row = _first_row(actions)
     if row is not None and recorder.live[row if len(actions) == len(recorder.live) else 0]:
-        found = np.asarray(actions)[row].tolist()
+        found = actions[row].tolist()
         raise ValueError(f"{_place(policy, recorder, row)}: the action is not finite, got {found}")
-    return Decided(actions, kept, seconds)
+    return Decided(actions, answer[1], seconds)
+
+
+def _shape(policy: Policy, observations: NDArray[Any], recorder: Recorder) -> tuple[int, ...]:
+    """Shape that the actions must have; a privileged policy answers for the whole team."""
+    task = recorder.task
+    size = task.action_size if isinstance(task, TeamTask) else 4
+    team = (recorder.team_size,) if getattr(policy, "privileged", False) else ()
+    return (len(observations), *team, size)
 
 
 def _first_row(values: NDArray[Any]) -> int | None:
@@ -62,6 +87,26 @@ def _first_row(values: NDArray[Any]) -> int | None:
 
 def _place(policy: Policy, recorder: Recorder, row: int) -> str:
     """Which policy, where."""
-    name, agent = getattr(policy, "name", type(policy).__name__), recorder.agents[row]
+    agent = recorder.agents[row]
     who = f"row {row}" + (f" ({agent})" if agent else "")
-    return f"policy {name!r}, {who} from seed {recorder.seeds[row]}, step {len(recorder.steps)}"
+    return (
+        f"policy {policy_name(policy)!r}, {who} from seed {recorder.seeds[row]}, step {len(recorder.steps)}"
+    )
+
+
+def _broken(policy: Policy, recorder: Recorder, what: str, line: str = "") -> PolicyError:
+    """The error for what a policy did to all rows, with the line of its file."""
+    first, last = recorder.seeds[0], recorder.seeds[-1]
+    when = f"seed {first}" if first == last else f"seeds {first} to {last}"
+    line = line or place_where_defined(getattr(policy, "predict", policy))
+    said = f"policy {policy_name(policy)!r}, from {when}, step {len(recorder.steps)}: {what}"
+    return PolicyError(f"{said}; {line}" if line else said)
+
+
+def _kind(answer: Any) -> str:
+    """What an answer is, for messages."""
+    if isinstance(answer, tuple):
+        return f"a tuple of {len(answer)}"
+    if hasattr(answer, "shape"):
+        return f"{type(answer).__name__} of shape {tuple(answer.shape)}, {getattr(answer, 'dtype', '')}"
+    return type(answer).__name__

@@ -13,21 +13,30 @@ from quad_envs.names import unknown_name
 from quad_envs.registration import TEAMS, TRACKING
 from quad_envs.tasks import BaseTask
 
+from .outside import import_named
+
 
 def make_env(env_id: str, **kwargs: Any) -> Any:
     """`gymnasium.make`, or the ParallelEnv of a multi-agent id; an unknown id gets the nearest one suggested.
 
+    Args:
+        env_id: The id; `module:id` imports the module first, which registers it, as Gymnasium has it.
+        kwargs: Of the environment.
+
     Raises:
         ValueError: If the id or an argument is unknown or not allowed.
     """
-    name = env_id.removeprefix("quad_envs:")
+    module, _, name = env_id.rpartition(":")
+    if module:
+        import_named(module, f"environment {env_id!r}")
     if name in TEAMS:  # not through PettingZoo's registry, which it has from 1.27 on
         try:
             return import_module(TEAMS[name]).parallel_env(**kwargs)
         except TypeError as error:
             raise ValueError(str(error)) from error
     if name not in gymnasium.registry:
-        raise ValueError(unknown_name("environment id", env_id, [*TRACKING, *TEAMS]))
+        others = [known for known in gymnasium.registry if module and known.startswith(name.split("/")[0])]
+        raise ValueError(unknown_name("environment id", env_id, [*TRACKING, *TEAMS, *others]))
     try:
         return gymnasium.make(name, **kwargs)
     except TypeError as error:  # Gymnasium repeats all arguments behind the environment's own message
@@ -37,6 +46,19 @@ def make_env(env_id: str, **kwargs: Any) -> Any:
 def is_parallel(env: Any) -> bool:
     """Whether an environment is a PettingZoo ParallelEnv, wrapped or not."""
     return hasattr(env, "possible_agents") and not hasattr(env, "agent_iter")
+
+
+def environment_of(source: Any) -> Any:
+    """The environment of an id, or the environment itself.
+
+    Raises:
+        ValueError: If it is neither.
+    """
+    if isinstance(source, BaseTask):
+        raise ValueError(
+            f"this policy is made from an environment, got the task of {source.env_id}: give the environment"
+        )
+    return make_env(source) if isinstance(source, str) else source
 
 
 def task_of(source: Any) -> BaseTask:

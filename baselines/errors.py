@@ -7,6 +7,10 @@ class PolicyCheckError(ValueError):
     """A policy does not keep the protocol; the message says where."""
 
 
+class PolicyError(ValueError):
+    """A policy from outside cannot be made, or broke off; the message names it and the line of its file."""
+
+
 class ResultsError(ValueError):
     """A results folder cannot be used; the message says why and what to do."""
 

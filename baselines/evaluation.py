@@ -1,4 +1,4 @@
-"""`evaluate`: one policy in one environment, or one team of its vehicles, over several starts."""
+"""One policy in one environment, or one team of its vehicles, over several starts: what it is worth."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ from .metrics import (
     totals,
     worst_violations,
 )
-from .policy import Policy, make_policy
+from .outside import is_policy
+from .policy import Policy, make_policy, policy_name
 from .results import plain_json
 from .rollout import Episode, is_privileged, run_episodes
 from .table import format_number, format_table
@@ -178,8 +179,8 @@ def _times(quantiles: tuple[float, float, float]) -> str:
     return f"p50 {p50} ms, p99 {p99} ms, max {slowest} ms"
 
 
-def evaluate(
-    policy: Policy | str,
+def fly_and_measure(
+    policy: Policy | Any,
     env: Any,
     episodes: int = 20,
     seed: int = 0,
@@ -187,13 +188,13 @@ def evaluate(
     *,
     mismatch: bool = False,
 ) -> Evaluation:
-    """Fly a policy from several starts and measure it.
+    """What `evaluate` does where nothing is to be written.
 
     Only numbers are kept of each flight, so that memory does not grow with its length. A team gives one
     record per vehicle and flight; means and intervals are over flights.
 
     Args:
-        policy: From `make_policy`, the name of one that it knows, or anything with `predict`.
+        policy: Anything with `predict`, or what `make_policy` takes.
         env: An id, a Gymnasium environment or a ParallelEnv (decisions are timed), or a vector environment.
         episodes: Number of flights, >= 1.
         seed: Flight i starts with the environment seed `seed + i`.
@@ -205,7 +206,8 @@ def evaluate(
         ValueError: If the id or the policy's name is unknown, episodes < 1, or as `run_episodes` says.
     """
     env, size = make_env(env) if isinstance(env, str) else env, 1
-    policy = make_policy(policy, env) if isinstance(policy, str) else policy
+    name = policy if isinstance(policy, str) else ""
+    policy = policy if is_policy(policy) else make_policy(policy, env)
     records, times, team_times = [], [], []
     for episode in run_episodes(policy, env, episodes, seed, mismatch=mismatch):
         records.append(measure(episode))
@@ -217,7 +219,7 @@ def evaluate(
     task: BaseTask = env.unwrapped.task
     return Evaluation(
         env_id=task.env_id,
-        policy=policy_name(policy),
+        policy=policy_name(policy, name),
         seed=seed,
         records=tuple(records),
         decision_ms=decision_quantiles(np.concatenate(times)),
@@ -226,8 +228,3 @@ def evaluate(
         spanning_tree=task.spanning_tree if isinstance(task, TeamTask) else None,
         privileged=is_privileged(policy),
     )
-
-
-def policy_name(policy: Any) -> str:
-    """Name of a policy for tables."""
-    return str(getattr(policy, "name", type(policy).__name__))

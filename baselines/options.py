@@ -40,7 +40,9 @@ class EvaluateOptions:
     """Fly one policy in one environment."""
 
     env: Annotated[str, Positional("environment id, as quad/HelixTracking-v0 or quad/Formation-v0")]
-    policy: Annotated[str, Positional("policy, as sdc-nmpc, or the folder of a trained one")]
+    policy: Annotated[
+        str, Positional("policy, as sdc-nmpc, the folder of a trained one, or module:factory of your own")
+    ]
     episodes: Annotated[int, "number of flights"] = 20
     seed: Annotated[int, "environment seed of the first flight"] = 0
     set: Annotated[list[str], "keyword argument of the environment; JSON, {key: value}, or text"] = field(
@@ -60,6 +62,9 @@ class BenchmarkOptions:
     """Fly a suite: environments x policies, from the same starts."""
 
     suite: Annotated[str, Positional("name of a shipped suite, or a .toml file")] = "default"
+    policy: Annotated[
+        list[str], "policy that flies, too, as module:factory of your own; several if repeated"
+    ] = field(default_factory=list)
     out: Annotated[Path | None, "results folder; runs/SUITE-DATE-TIME if not given"] = None
     episodes: Annotated[int | None, "flights per environment and policy, instead of the suite's"] = None
     seed: Annotated[int | None, "environment seed of the first flight, instead of the suite's"] = None
@@ -175,7 +180,7 @@ def add_options(parser: argparse.ArgumentParser, kind: type[Any]) -> None:
         if positional:
             settings["nargs"] = "*" if many else None if required else "?"
         elif many:
-            settings |= {"action": "append", "metavar": "KEY=VALUE"}
+            settings |= {"action": "append", "metavar": "NAME" if entry.name == "policy" else "KEY=VALUE"}
         elif hint is not bool:
             settings["metavar"] = {int: "N", float: "S", Path: "FOLDER"}.get(settings["type"], "NAME")
         if positional:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_envs.names import unknown_name
 
+from .outside import build, installed_policies, is_outside, names_factory, outside_options
 from .trained import load_policy, names_trained, shipped_policies
 
 if TYPE_CHECKING:  # not at run time: tasks load numba, and `quad-envs list` has to be quick
@@ -182,8 +183,12 @@ def policy_entry(name: str, mission: str | None = None) -> PolicyEntry:
     """
     known = TEAM_POLICIES | TRACKING_POLICIES
     if name not in known:
-        names = [*(known if mission is None else serving(mission)), *shipped_policies()]
-        raise ValueError(unknown_name("policy", name, names) + ", or the folder of a trained one")
+        able = known if mission is None else serving(mission)
+        names = [*able, *shipped_policies(), *installed_policies()]
+        raise ValueError(
+            unknown_name("policy", name, names)
+            + ", the folder of a trained one, or module:factory of your own"
+        )
     if mission is None:
         return known[name]
     able = serving(mission)
@@ -197,7 +202,14 @@ def policy_entry(name: str, mission: str | None = None) -> PolicyEntry:
 
 def is_trained(name: str | os.PathLike[str]) -> bool:
     """Whether a name is that of a trained policy, and not of a controller."""
-    return name not in TEAM_POLICIES | TRACKING_POLICIES and names_trained(name)
+    return not (name in TEAM_POLICIES | TRACKING_POLICIES or names_factory(name)) and names_trained(name)
+
+
+def from_outside(source: Any) -> bool:
+    """Whether a policy, or its name, is none of this suite, whose own names go before others."""
+    if isinstance(source, str) and (source in TEAM_POLICIES | TRACKING_POLICIES or is_trained(source)):
+        return False
+    return is_outside(source)
 
 
 def _factory(entry: PolicyEntry) -> Callable[..., Any]:
@@ -205,12 +217,20 @@ def _factory(entry: PolicyEntry) -> Callable[..., Any]:
     return found
 
 
+def policy_name(policy: Any, otherwise: str = "") -> str:
+    """Name of a policy for tables: its own, or else the other one, or else its class."""
+    return str(getattr(policy, "name", otherwise or type(policy).__name__))
+
+
 def policy_options(name: str) -> dict[str, Any]:
     """Options of a policy and their defaults.
 
     Raises:
         ValueError: If the name is unknown.
+        PolicyError: If it is one of the user's that cannot be imported.
     """
+    if from_outside(name):
+        return outside_options(name)
     factory = _factory(policy_entry(name))
     parameters = list(inspect.signature(factory).parameters.values())[1:]  # the first is the task
     return {parameter.name: parameter.default for parameter in parameters}
@@ -231,12 +251,14 @@ def _check_kind(name: str, option: str, value: Any, default: Any) -> None:
         raise ValueError(f"{option} of policy {name!r} must be {kind}, got {value!r} (default {default!r})")
 
 
-def make_policy(name: str | os.PathLike[str], env: Any, **options: Any) -> Policy:
+def make_policy(name: str | os.PathLike[str] | Any, env: Any, **options: Any) -> Policy:
     """A policy for a task.
 
     Args:
         name: One of TRACKING_POLICIES, or for a team one of TEAM_POLICIES; or a trained policy: the folder
-            of its training, or the name of a shipped one.
+            of its training, or the name of a shipped one; or one of the user's: `module:factory`, the name of
+            an entry point, a factory, or a policy. A factory is called with the task, or with the environment
+            if its first parameter is called `env`.
         env: An environment (wrapped or not), a vector environment, an id, or a Task. Only its Task is used.
         options: Of the policy, see `policy_options`; MPCs take `horizon`, `solver` and what their chapter
             offers. A horizon that is not given is 25, or the preview of the task where that is shorter.
@@ -246,9 +268,13 @@ def make_policy(name: str | os.PathLike[str], env: Any, **options: Any) -> Polic
         ValueError: If the name, an option or its value is not allowed, the policy is for other tasks, or the
             horizon exceeds the preview.
         CheckpointError: If a trained policy cannot be read, or is for other tasks.
+        PolicyError: If one of the user's cannot be made; the message names the line of the user's file.
     """
-    from .environments import task_of
+    from .environments import environment_of, task_of
 
+    if from_outside(name):
+        made: Policy = build(name, lambda: task_of(env), lambda: environment_of(env), options)
+        return made
     if is_trained(name):
         if options:
             raise ValueError(f"a trained policy has no options, got {', '.join(options)}")

@@ -6,6 +6,7 @@ episodes/*.npz     the first flights of each unit, or all if asked for; a team i
 report.html        the leaderboard and these flights to look at, see `baselines.report`
 results.csv        one row per environment x policy x flight (x vehicle), when all units are finished
 summary.csv        one row per environment x policy
+failures.json      policies from outside that could not be made or broke off, where, and why
 contenders.csv     one row per environment x contender, where networks are trained: all seeds are one
 networks/          folders of the networks that are trained, see training/run_folder.py
 """
@@ -35,10 +36,12 @@ import quad_envs
 from .errors import ResultsError
 
 _LOCK = ".lock"
+FAILURES = "failures.json"
 _RESULTS = (
     "results.csv",
     "summary.csv",
     "contenders.csv",
+    FAILURES,
     "report.html",
     "replay.html",
     "cells/*.json",

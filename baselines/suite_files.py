@@ -11,6 +11,8 @@ name = "sdc-nmpc"
 label = "sdc-nmpc, N 15"
 kwargs = {horizon = 15}
 [[policies]]
+name = "mypolicy:make"       # module:factory of your own, or an entry point of an installed package
+[[policies]]
 name = "ppo"                 # an algorithm: one network is trained in each environment and with each seed
 train = {seeds = [0, 1, 2], steps = 4_000_000}
 [[policies]]
@@ -36,7 +38,7 @@ from typing import Any, TypeVar
 from quad_envs.names import unknown_name
 from quad_envs.registration import TEAMS, TRACKING
 
-from .policy import TEAM_POLICIES, TRACKING_POLICIES
+from .policy import TEAM_POLICIES, TRACKING_POLICIES, from_outside
 from .suite import Condition, EnvChoice, PolicyChoice, Suite, Training
 from .trained import names_trained
 from .training.algorithms import ALGORITHMS
@@ -102,7 +104,7 @@ def _checked(table: dict[str, Any], kind: type[Any], suite: str) -> dict[str, An
     if table.get("train", 0) is None:
         del table["train"]
     allowed = _allowed(kind, table)
-    if allowed is not None and table[key] not in allowed and not names_trained(table[key]):
+    if allowed is not None and table[key] not in allowed and not _is_users(kind, table[key]):
         raise ValueError(unknown_name(f"{key} in suite {suite!r}:", table[key], allowed))
     if not isinstance(table.get("kwargs", {}), Mapping):
         raise ValueError(
@@ -120,6 +122,13 @@ def _checked(table: dict[str, Any], kind: type[Any], suite: str) -> dict[str, An
     else:
         table.pop("envs", None)
     return table
+
+
+def _is_users(kind: type[Any], name: Any) -> bool:
+    """Whether a name is one of the user's: a checkpoint, `module:factory`, an entry point, `module:id`."""
+    if kind is PolicyChoice and from_outside(name):
+        return True
+    return names_trained(name) or (kind is EnvChoice and ":" in name)
 
 
 def _allowed(kind: type[Any], table: Mapping[str, Any]) -> list[str] | None:

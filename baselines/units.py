@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from .episode import Episode
 from .suite import EnvChoice, PolicyChoice, Suite, Training, is_for
 
 
@@ -23,6 +25,15 @@ class TrainingUnit(NamedTuple):
         return self.policy.train
 
 
+class Given(NamedTuple):
+    """Objects that fly and that no name in a suite stands for; a program that goes on later has others."""
+
+    policy: Any = None  # with `predict`, or a factory; None: the name in the suite
+    env: Any = None  # None: the id in the suite
+    on_episode: Callable[[Episode], None] | None = None  # called with each flight
+    mismatch: bool = False  # whether the policy may be one of another task on purpose
+
+
 class Unit(NamedTuple):
     """A policy to fly in an environment."""
 
@@ -34,6 +45,17 @@ class Unit(NamedTuple):
     seed: int
     episode_folder: Path | None  # where to save flights
     flights_saved: int = 0  # how many, the first ones
+    given: Given = Given()
+
+    @property
+    def named(self) -> bool:
+        """Whether names alone say what is flown, so that a stored result stands for it."""
+        return all(value is None or value is False for value in self.given)
+
+    @property
+    def source(self) -> Any:
+        """The policy, or its name for `make_policy`."""
+        return self.policy_name if self.given.policy is None else self.given.policy
 
     @property
     def file_name(self) -> str:

@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import baselines.benchmark
 import baselines.results
+import baselines.sweep
 from baselines import Results, ResultsError, Suite, load_suite, run_benchmark
 from baselines.evaluation import Evaluation
 from baselines.policy import TRACKING_POLICIES
@@ -50,13 +50,13 @@ def finished(tmp_path_factory):
 def flown(monkeypatch):
     """Titles of the units that are flown."""
     titles = []
-    real = baselines.benchmark.fly_unit
+    real = baselines.sweep.fly_unit
 
     def count(unit):
         titles.append((unit.env.title, unit.policy.title))
         return real(unit)
 
-    monkeypatch.setattr(baselines.benchmark, "fly_unit", count)
+    monkeypatch.setattr(baselines.sweep, "fly_unit", count)
     return titles
 
 
@@ -153,7 +153,7 @@ def test_another_suite_in_the_same_folder_is_refused(tmp_path):
 
 def test_results_of_other_sources_are_not_mixed(tmp_path, monkeypatch):
     run_benchmark(SMALL, tmp_path)
-    monkeypatch.setattr(baselines.benchmark, "source_digest", lambda: "0123abc")
+    monkeypatch.setattr(baselines.sweep, "source_digest", lambda: "0123abc")
     with pytest.raises(ResultsError, match="begun with other sources"):
         run_benchmark(SMALL, tmp_path)
 

@@ -16,10 +16,10 @@ import pytest
 from processes import start_command
 
 from baselines.__main__ import COMMANDS, main
-from baselines.benchmark import REPORTED
 from baselines.commands import _resume
 from baselines.options import BenchmarkOptions, read_assignments
 from baselines.policy import TEAM_POLICIES, TRACKING_POLICIES
+from baselines.sweep import REPORTED
 from quad_envs.registration import TEAMS, TRACKING
 
 HELIX = "quad/HelixTracking-v0"

@@ -15,12 +15,12 @@ import baselines.report.build
 import baselines.report.commands
 from baselines import ResultsError, run_benchmark
 from baselines.__main__ import main
-from baselines.benchmark import REPORTED
 from baselines.report import Choice, build_report, read_run, render_report
 from baselines.report.flights import BadFlightError, read_flight
 from baselines.report.page import embed, render_page
 from baselines.report.quantise import Blobs, decode, encode
 from baselines.report.shelf import _PER_FLIGHT
+from baselines.sweep import REPORTED
 
 EVIL = "</script><script>alert('{{style}}')</script><!--"
 HELIX, TEAM = "quad/HelixTracking-v0", "team of 3"

@@ -13,9 +13,9 @@ pytest.importorskip("stable_baselines3")
 
 import torch
 
+from baselines import evaluate
 from baselines.environments import make_env
 from baselines.errors import TrainingError
-from baselines.evaluation import evaluate
 from baselines.training.lagrangian import (
     CostCritic,
     LagrangianBuffer,

@@ -11,7 +11,6 @@ import pytest
 
 from baselines import evaluate, load_suite, make_policy, measure, run_benchmark, run_episodes
 from baselines.__main__ import main
-from baselines.benchmark import flight_arrays
 from baselines.comparison import Results
 from baselines.environments import make_env, task_of
 from baselines.episode import Episode
@@ -21,6 +20,7 @@ from baselines.metrics import Record, estimate, paired_difference, summarize, to
 from baselines.policy import Estimates, PolicyState
 from baselines.suite_files import suite_from_dict
 from baselines.team_metrics import TEAM_COLUMNS, flight_values
+from baselines.unit_flights import flight_arrays
 from baselines.units import suite_units
 from quad_envs import cooperative_estimation_v0, formation_v0, target_tracking_v0
 from quad_envs.registration import TEAMS

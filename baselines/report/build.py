@@ -98,10 +98,11 @@ def _resolve(run: Run, choice: Choice) -> dict[str, Any]:
 
 
 def _notes_of_run(run: Run) -> tuple[str, ...]:
-    done = len(run.finished)
-    if done == run.units:
-        return ()
-    return (f"This run is not complete: {done} of {run.units} units (environment x policy) are finished.",)
+    done, failed = len(run.finished), len(run.failures)
+    if done + failed >= run.units:
+        return run.failures
+    incomplete = f"This run is not complete: {done} of {run.units} units (environment x policy) are finished."
+    return (incomplete, *run.failures)
 
 
 def _provenance(run: Run) -> dict[str, Any]:

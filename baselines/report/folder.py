@@ -13,7 +13,7 @@ from baselines.comparison import Results
 from baselines.errors import ResultsError
 from baselines.evaluation import Evaluation
 from baselines.metrics import Record
-from baselines.results import RESULTS_FORMAT, plain_json, read_json
+from baselines.results import FAILURES, RESULTS_FORMAT, plain_json, read_json
 from baselines.suite import EnvChoice, Suite
 from baselines.team_metrics import by_flight
 from baselines.units import Unit, suite_units
@@ -42,6 +42,7 @@ class Run(NamedTuple):
     suite: Suite
     finished: tuple[Finished, ...]
     units: int  # that the suite has
+    failures: tuple[str, ...] = ()  # policies from outside that did not fly, and why
 
     def environments(self) -> list[tuple[EnvChoice, Results, list[Finished]]]:
         """Environments of which something is flown, each with its table and its units."""
@@ -106,7 +107,17 @@ def read_run(folder: Path) -> Run:
             f"nothing in {str(folder)!r} is finished yet; run the same command again: it "
             "goes on where it stopped"
         )
-    return Run(folder, config, suite, finished, len(units))
+    return Run(folder, config, suite, finished, len(units), _failures(folder))
+
+
+def _failures(folder: Path) -> tuple[str, ...]:
+    """What failures.json says; a folder of before has none."""
+    path = folder / FAILURES
+    found = read_json(path) if path.is_file() else []
+    try:
+        return tuple(f"{one['policy']} did not fly in {one['env']}: {one['message']}" for one in found)
+    except (KeyError, TypeError) as error:
+        raise ResultsError(f"{str(path)!r} is not ours ({error!r}); delete it") from error
 
 
 def read_contenders(folder: Path) -> dict[str, list[dict[str, str]]]:

@@ -17,7 +17,7 @@ import numpy as np
 from quad_envs.names import unknown_name
 from quad_envs.registration import TEAMS, TRACKING
 
-from ..evaluation import evaluate
+from ..evaluation import fly_and_measure
 from .networks import Network, NetworkPolicy
 
 HELD_OUT = 10_000  # the first environment seed that training must not use
@@ -101,7 +101,7 @@ class HeldOutFlights:
             progress: Of its training.
             seed: Environment seed of the first flight.
         """
-        found = evaluate(NetworkPolicy(network, self.task, "training"), self.env, self.flights, seed)
+        found = fly_and_measure(NetworkPolicy(network, self.task, "training"), self.env, self.flights, seed)
         summary = found.summary()
         return Point(
             cpu_seconds=cpu_seconds,

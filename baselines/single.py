@@ -1,0 +1,83 @@
+"""`evaluate`: one policy in one environment; its numbers, and with a folder its flights and its page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from quad_envs.tasks import BaseTask, TeamTask
+
+from .benchmark import fly_suite
+from .environments import require_own_task
+from .episode import Episode
+from .evaluation import Evaluation, fly_and_measure
+from .outside import name_of
+from .policy import Policy, policy_name
+from .results import plain_json
+from .suite import EnvChoice, PolicyChoice, Suite
+from .sweep import Order
+from .units import Given
+
+
+def evaluate(
+    policy: Policy | Any,
+    env: Any,
+    episodes: int = 20,
+    seed: int = 0,
+    on_episode: Callable[[Episode], None] | None = None,
+    *,
+    mismatch: bool = False,
+    out: str | Path | None = None,
+    fresh: bool = False,
+) -> Evaluation:
+    """Fly a policy from several starts and measure it.
+
+    Only numbers are kept of each flight, so that memory does not grow with its length. A team gives one
+    record per vehicle and flight; means and intervals are over flights.
+
+    Args:
+        policy: Anything with `predict`, or what `make_policy` takes: a name, `module:factory`, a factory.
+        env: An id, a Gymnasium environment or a ParallelEnv (decisions are timed), or a vector environment.
+        episodes: Number of flights, >= 1.
+        seed: Flight i starts with the environment seed `seed + i`.
+        on_episode: Called with each flight, of a team with that of each vehicle, to save or plot it.
+        mismatch: Whether the policy may be one of another task on purpose, see `run_episodes`. Conditions
+            with `randomize` need it not: the task knows the nominal vehicle.
+        out: Results folder with every flight, the tables and report.html, the leaderboard of one; as that of
+            `run_benchmark`. Objects fly again when it is called again.
+        fresh: Whether to discard what the folder holds of an earlier run.
+
+    Raises:
+        ValueError: If the id or the policy's name is unknown, episodes < 1, or as `run_episodes` says.
+        PolicyError: If a policy from outside cannot be made or breaks off; the message names the line.
+        ResultsError: If the folder is in use, holds another run, or cannot be written.
+    """
+    if out is None:
+        return fly_and_measure(policy, env, episodes, seed, on_episode, mismatch=mismatch)
+    choice = PolicyChoice(policy) if isinstance(policy, str) else _choice_of(policy)
+    suite = Suite("evaluate", (_env_choice(env),), (choice,), episodes, seed)
+    given = Given(
+        None if isinstance(policy, str) else policy,
+        None if isinstance(env, str) else env,
+        on_episode,
+        mismatch,
+    )
+    return fly_suite(suite, {choice.title: given}, out, Order(save_episodes=True, fresh=fresh)).evaluations[0]
+
+
+def _choice_of(policy: Any) -> PolicyChoice:
+    return PolicyChoice(name_of(policy), label=policy_name(policy))
+
+
+def _env_choice(env: Any) -> EnvChoice:
+    """An environment as a suite names it: with the arguments of its spec, where it has one."""
+    if isinstance(env, str):
+        return EnvChoice(env)
+    require_own_task(env)
+    if hasattr(env, "num_envs") and isinstance(env.unwrapped.task, TeamTask):
+        raise ValueError(f"out needs one team at a time: give parallel_env of its module, got {env!r}")
+    task: BaseTask = env.unwrapped.task
+    kwargs = dict(getattr(getattr(env, "spec", None), "kwargs", {}))
+    kwargs.pop("env_id", None)
+    return EnvChoice(task.env_id, plain_json(kwargs))
