@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from quad_envs._numba import kernel
 
+from .rows import first_not_finite
+
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
@@ -40,15 +42,15 @@ def forward_rows(
         out: Result, (n, sizes[-1]).
 
     Returns:
-        -1, or the index i * sizes[0] + k of the first input that is not finite.
+        -1, or the flat index of the first entry of the observations that is not finite, seen or not.
     """
     layers = sizes.size - 1
     for r in range(observations.shape[0]):
+        bad = first_not_finite(observations[r])
+        if bad >= 0:
+            return int(r * observations.shape[1] + bad)
         for k in range(columns.size):
-            value = observations[r, columns[k]]
-            if not math.isfinite(value):
-                return r * columns.size + k
-            work[0, k] = value
+            work[0, k] = observations[r, columns[k]]
         at = 0
         for layer in range(layers):
             n, m = sizes[layer], sizes[layer + 1]

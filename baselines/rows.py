@@ -17,9 +17,12 @@ def as_rows(observation: NDArray[Any], size: int) -> tuple[Actions, bool]:
     """Observations as rows (n, size) float32, and whether it was a single one.
 
     Raises:
-        ValueError: If the shape is another one.
+        ValueError: If the shape is another one, or what is there are no real numbers.
     """
-    obs = np.ascontiguousarray(observation, dtype=np.float32)
+    given = np.asarray(observation)
+    if given.dtype.kind not in "fiub":
+        raise ValueError(f"observation must be an array of real numbers, got dtype {given.dtype}")
+    obs = np.ascontiguousarray(given, dtype=np.float32)
     one = obs.ndim == 1
     if one:
         obs = obs.reshape(1, -1)

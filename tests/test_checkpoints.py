@@ -5,6 +5,7 @@ import os
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -80,11 +81,26 @@ def test_few_rows_get_the_same_as_many(squash, commands):
 
 
 @pytest.mark.parametrize("rows", [1, 50])
-def test_an_observation_that_is_not_finite_is_refused_by_name(rows):
-    seen = np.tile(observations(1), (rows, 1))
-    seen[-1, 2] = np.nan
-    with pytest.raises(ValueError, match=rf"observation {rows - 1} is not finite: V_B\[2\] is nan"):
-        NetworkPolicy(network_for(), task_of(HELIX), "x").predict(seen)
+@pytest.mark.parametrize(("at", "part"), [(2, "entry 2 of 'V_B'"), (18 + 8 * 4, "entry 32 of 'preview'")])
+def test_a_network_refuses_what_an_mpc_refuses_in_its_words(rows, at, part):
+    """Also in stages of the preview that it does not look at: what made them made the others, too."""
+    task = task_of(HELIX)
+    policies = NetworkPolicy(network_for(), task, "x"), make_policy("lqr", task)
+    good = np.tile(observations(1), (rows, 1))
+    bad = good.copy()
+    bad[-1, at] = np.nan
+    mistakes = [
+        ((bad,), rf"observation {rows - 1} is not finite: {part} \(index {at}\) is nan; check the sensors"),
+        ((good[:, :-1],), r"observation must have shape \(n, 226\) or \(226,\), got"),
+        ((good.astype(object),), "observation must be an array of real numbers, got dtype object"),
+        ((good.astype(complex),), "observation must be an array of real numbers, got dtype complex128"),
+        ((good, None, np.ones(rows + 1, bool)), rf"episode_start must have shape \({rows},\)"),
+        ((good, policies[1].predict(np.tile(good, (2, 1)))[1]), f"state has {2 * rows} rows"),
+    ]
+    for policy in policies:
+        for arguments, message in mistakes:
+            with pytest.raises(ValueError, match=message):
+                policy.predict(*arguments)
 
 
 def test_outputs_and_actions_turn_into_each_other():
@@ -160,6 +176,32 @@ def wrong_shapes(folder):
     describe(folder, digest=_digest((folder / "network.safetensors").read_bytes()))
 
 
+def scaled(name, value):
+    """Another mean or scale of one feature."""
+
+    def spoil(folder):
+        features = json.loads((folder / "policy.json").read_text())["features"]
+        features[name][1] = value
+        describe(folder, features=features)
+
+    return spoil
+
+
+def not_regular(name, make):
+    """Something else in place of a file."""
+
+    def spoil(folder):
+        (folder / name).unlink()
+        make(folder / name)
+
+    return spoil
+
+
+def endless(path):
+    with path.open("wb") as file:
+        file.truncate(2**40)  # sparse: a terabyte that takes no place
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
@@ -173,6 +215,25 @@ def wrong_shapes(folder):
         (pickle_in_disguise, "pickles are never opened"),
         (not_finite, "layer 1 of a network is not finite"),
         (wrong_shapes, "layer 1 of a network must take 16 inputs"),
+        (
+            scaled("mean", np.nan),
+            r"mean and scale of a network's feature 'V_B\[1\]' must be finite.* got nan",
+        ),
+        (scaled("mean", np.inf), "must be finite"),
+        (scaled("mean", 10**400), "is not a valid network"),
+        (scaled("mean", 1e300), r"float32 cannot hold .* layer 0 .* 'V_B\[1\]' has mean 1e\+300"),
+        (scaled("scale", 1e-300), r"float32 cannot hold .* 'V_B\[1\]' has mean 0.0, scale 1e-300"),
+        (scaled("scale", 1e-40), r"'V_B\[1\]' has mean 0.0, scale 1e-40"),
+        (scaled("scale", 0.0), "the scale > 0, got 0.0 and 0.0"),
+        (scaled("scale", np.inf), "must be finite"),
+        (scaled("scale", np.nan), "must be finite"),
+        (lambda folder: (folder / "policy.json").write_text("[" * 100_000), "is not valid JSON"),
+        (not_regular("policy.json", os.mkfifo), r"policy\.json is no regular file"),
+        (not_regular("network.safetensors", os.mkfifo), r"network\.safetensors is no regular file"),
+        (not_regular("policy.json", lambda path: os.symlink("/dev/zero", path)), "is no regular file"),
+        (not_regular("network.safetensors", os.mkdir), r"cannot read network\.safetensors: Is a directory"),
+        (not_regular("policy.json", lambda path: os.symlink(path, path)), r"cannot read policy\.json"),
+        (not_regular("network.safetensors", endless), "has more than 50000000 bytes"),
     ],
 )
 def test_anything_else_is_refused(saved, monkeypatch, tmp_path, spoil, message):
@@ -181,6 +242,39 @@ def test_anything_else_is_refused(saved, monkeypatch, tmp_path, spoil, message):
     with pytest.raises(CheckpointError, match=message):
         make_policy(saved, HELIX)
     assert not (tmp_path / "opened").exists()
+
+
+@pytest.mark.parametrize("layer", [1, 2])
+def test_layers_behind_the_first_may_not_overflow_either(layer):
+    network = network_for()
+    weights = list(network.weights)
+    weights[layer] = np.full_like(weights[layer], 1e38)
+    with pytest.raises(ValueError, match=f"float32 cannot hold the sums of layer {layer} of a network"):
+        replace(network, weights=tuple(weights))
+
+
+def test_what_is_accepted_answers_finite_numbers_to_the_largest_observations():
+    network, task = network_for(), task_of(HELIX)
+    scale = np.array(network.features.scale)
+    scale[3] = 1e-30
+    policy = NetworkPolicy(
+        replace(network, features=replace(network.features, scale=tuple(scale))), task, "x"
+    )
+    for sign in (-1.0, 1.0):
+        for rows in (1, 9):
+            seen = np.full((rows, task.layout.size), sign * 1e6, np.float32)
+            assert np.isfinite(policy.predict(seen)[0]).all()
+
+
+def test_the_shipped_networks_differ_by_rounding_alone_with_the_number_of_rows():
+    """Tutorials promise 1e-6: products of float32 are summed in another order."""
+    seen = np.tile(observations(3), (20, 1))
+    for name in ("apg-helix", "ppo-helix", "dagger-helix"):
+        policy = make_policy(name, HELIX)
+        together = policy.predict(seen)[0]
+        for rows in (1, 2, 5, 16):
+            apart = np.concatenate([policy.predict(seen[i : i + rows])[0] for i in range(0, 60, rows)])
+            assert np.abs(apart - together).max() < 1e-6
 
 
 def test_a_network_that_sees_what_is_not_there_is_refused(saved):

@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 import platform
+import stat
 from collections.abc import Mapping
 from contextlib import suppress
 from importlib import metadata
@@ -120,29 +121,39 @@ def load_checkpoint(folder: str | Path) -> tuple[Network, dict[str, Any]]:
             squash=described["squash"],
             commands=described["commands"],
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise CheckpointError(f"{where} is not a valid network: {error}") from error
     return network, described
 
 
+def _open_at_once(path: str, flags: int) -> int:
+    """A pipe is opened, too, without waiting for its writer."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
 def _read(file: Path, where: str) -> bytes:
+    """The bytes of a regular file; pipes and devices, which may have no end, are not read."""
     try:
-        if file.stat().st_size > _LARGEST:
-            raise CheckpointError(
-                f"{where}: {file.name} has {file.stat().st_size} bytes; a checkpoint has at most {_LARGEST}"
-            )
-        return file.read_bytes()
+        with open(file, "rb", opener=_open_at_once) as stream:
+            if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+                raise CheckpointError(f"{where}: {file.name} is no regular file")
+            data = stream.read(_LARGEST + 1)
     except OSError as error:
         raise CheckpointError(
             f"{where}: cannot read {file.name}: {error.strerror or error}; a checkpoint is a folder with "
             f"{WEIGHTS} and {DESCRIPTION}"
         ) from error
+    if len(data) > _LARGEST:
+        raise CheckpointError(
+            f"{where}: {file.name} has more than {_LARGEST} bytes; no checkpoint of ours has"
+        )
+    return data
 
 
 def _read_description(path: Path, where: str) -> dict[str, Any]:
     try:
         described = json.loads(_read(path / DESCRIPTION, where))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{where}: {DESCRIPTION} is not valid JSON: {error}") from error
     if not isinstance(described, dict) or described.get("format") != FORMAT:
         found = described.get("format") if isinstance(described, dict) else described

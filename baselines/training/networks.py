@@ -7,20 +7,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal, NoReturn, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_envs._numba import entry_of
 from quad_envs.agent_observations import AgentLayout
+from quad_envs.names import shown
 from quad_envs.observations import N_REFERENCE, TrackingLayout
 from quad_envs.parameters import Array
 from quad_envs.tasks import BaseTask, Task, TeamTask
 
 from ..network_kernels import forward_rows
 from ..policy import Actions, PolicyState
-from ..rows import as_rows, state_of
+from ..rows import as_rows, as_starts, not_finite, state_of
 
 Floats = NDArray[np.float32]
 Squash = Literal["tanh", "clip"]
@@ -29,6 +30,7 @@ Commands = Literal["hover", "action"]
 # Preview stages that a network sees: near ones densely, the horizon of the MPCs at the end.
 TRACKING_STAGES = (0, 1, 2, 3, 5, 7, 10, 14, 19, 25)
 _FEW = 4  # rows up to which the compiled form is faster
+_LARGEST_SEEN = 1e6  # SI, of an observation for which layers must not overflow
 _forward = entry_of(forward_rows)
 # Typical size of each part, so that a network sees numbers of order one.
 _SCALES = {
@@ -129,7 +131,8 @@ class Network:
     """Tanh layers over features, a linear layer, and what its outputs command.
 
     Raises:
-        ValueError: If the shapes do not fit together or a number is not finite.
+        ValueError: If the shapes do not fit together, a number is not finite, or a layer, the first with its
+            scaling, could overflow float32.
     """
 
     features: Features
@@ -160,8 +163,39 @@ class Network:
             if not (np.isfinite(W).all() and np.isfinite(b).all()):
                 raise ValueError(f"layer {k} of a network is not finite")
             n = W.shape[1]
-        if not min(self.features.scale, default=1.0) > 0.0:
-            raise ValueError("scales of a network's features must be > 0")
+        for name, mean, scale in zip(
+            self.features.names, self.features.mean, self.features.scale, strict=True
+        ):
+            if not (np.isfinite(mean) and np.isfinite(scale) and scale > 0.0):
+                raise ValueError(
+                    f"mean and scale of a network's feature {shown(name)} must be finite, the scale > 0, got "
+                    f"{mean!r} and {scale!r}"
+                )
+        self._check_overflow()
+
+    def _check_overflow(self) -> None:
+        """Refuse layers whose sums could leave float32 for observations up to _LARGEST_SEEN."""
+        most, seen = float(np.finfo(np.float32).max), self.features
+        for k, (W, b) in enumerate(self.layers()):
+            bound = 1.0 if k else _LARGEST_SEEN
+            reach = bound * np.abs(W.astype(np.float64)).sum(axis=0) + np.abs(b.astype(np.float64))
+            if np.all(reach < most):
+                continue
+            worst = int(np.argmax((_LARGEST_SEEN + np.abs(seen.mean)) / np.asarray(seen.scale)))
+            of = f"layer {k} of a network"
+            if k == 0:
+                name, mean, scale = (part[worst] for part in (seen.names, seen.mean, seen.scale))
+                of += f" with (observation - mean) / scale: {shown(name)} has mean {mean!r}, scale {scale!r}"
+            raise ValueError(f"float32 cannot hold the sums of {of}")
+
+    def layers(self) -> list[tuple[Floats, Floats]]:
+        """Weights and biases for observations as they are: scaling is a part of the first layer."""
+        scale = np.asarray(self.features.scale, dtype=np.float64)
+        mean = np.asarray(self.features.mean, dtype=np.float64)
+        with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is looked at
+            W = self.weights[0] / scale[:, None]
+            first = W.astype(np.float32), (self.biases[0] - mean @ W).astype(np.float32)
+        return [first, *zip(self.weights[1:], self.biases[1:], strict=True)]
 
     @property
     def outputs(self) -> int:
@@ -228,12 +262,7 @@ class NetworkPolicy:
         self.network, self.task, self.name, self.kind = network, task, name, kind
         self._size = task.layout.size
         self._columns = network.features.columns(task.layout)
-        # Scaling is a part of the first layer.
-        scale = np.asarray(network.features.scale, dtype=np.float64)
-        mean = np.asarray(network.features.mean, dtype=np.float64)
-        W = network.weights[0] / scale[:, None]
-        first = W.astype(np.float32), (network.biases[0] - mean @ W).astype(np.float32)
-        self._layers = [first, *zip(network.weights[1:], network.biases[1:], strict=True)]
+        self._layers = network.layers()
         self._sizes = np.array([len(self._columns), *(len(b) for _, b in self._layers)], dtype=np.int64)
         self._flat = np.concatenate([part.reshape(-1) for layer in self._layers for part in layer])
         hover = network.commands == "hover"
@@ -251,12 +280,19 @@ class NetworkPolicy:
     ) -> tuple[Actions, PolicyState]:
         """Choose actions; see `Policy`.
 
+        Up to four rows are summed in another order than more, and matrix products round by their size: the
+        action of a row differs by up to 1e-6 with the number of rows beside it.
+
         Raises:
-            ValueError: If a shape is wrong or an observation is not finite.
+            ValueError: If a shape is wrong or an observation is not finite; it names the part.
         """
         obs, one = as_rows(observation, self._size)
-        actions = self._few(obs) if len(obs) <= _FEW else self._many(obs)
-        return actions[0] if one else actions, _no_state(len(obs))
+        n = len(obs)
+        if episode_start is not None:
+            as_starts(episode_start, n)
+        kept = _no_state(n) if state is None else state_of(state, n, 0)
+        actions = self._few(obs) if n <= _FEW else self._many(obs)
+        return actions[0] if one else actions, kept
 
     def _few(self, obs: Floats) -> Actions:
         """Without the cost of calling numpy."""
@@ -265,14 +301,15 @@ class NetworkPolicy:
         squash = self.network.squash == "tanh"
         bad = _forward(obs, self._columns, self._sizes, self._flat, squash, self._gain, work, out)
         if bad >= 0:
-            self._refuse(obs, *divmod(bad, len(self._columns)))
+            raise not_finite(obs, bad, self.task.layout.slices)
         return out
 
     def _many(self, obs: Floats) -> Actions:
         """The same in numpy."""
+        finite = np.isfinite(obs)
+        if not finite.all():
+            raise not_finite(obs, int(np.argmin(finite)), self.task.layout.slices)
         x = obs[:, self._columns]
-        if not np.isfinite(x).all():
-            self._refuse(obs, *np.argwhere(~np.isfinite(x))[0].tolist())
         for k, (W, b) in enumerate(self._layers):
             x = x @ W
             x += b
@@ -280,10 +317,6 @@ class NetworkPolicy:
                 np.tanh(x, out=x)
         np.clip(x, -1.0, 1.0, out=x)
         return hover_actions(x, self.task) if self.network.commands == "hover" else x
-
-    def _refuse(self, obs: Floats, row: int, column: int) -> NoReturn:
-        value, name = obs[row, self._columns[column]], self.network.features.names[column]
-        raise ValueError(f"observation {row} is not finite: {name} is {value}; check the sensors")
 
 
 @lru_cache(maxsize=64)
