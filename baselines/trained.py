@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quad_envs.names import unknown_name
+from quad_envs.names import shown, unknown_name
 
 from .errors import CheckpointError
 
@@ -86,8 +86,8 @@ def load_policy(source: str | os.PathLike[str], env: Any) -> NetworkPolicy:
     where, mission = f"checkpoint {str(folder)!r}", said.get("mission")
     if mission is not None and mission != mission_of(task):
         raise CheckpointError(
-            f"{where} was trained on {said.get('env_id')}, a {mission} task; {task.env_id} is one of "
-            f"{mission_of(task)}: train one for it with quad-envs train {task.env_id}"
+            f"{where} was trained on {shown(said.get('env_id'))}, a task of the kind {shown(mission)}; "
+            f"{task.env_id} is one of {mission_of(task)}: train one for it with quad-envs train {task.env_id}"
         )
     name = os.fspath(source) if folder.parent == SHIPPED else folder.name or str(folder)
     try:

@@ -206,7 +206,10 @@ def endless(path):
     ("spoil", "message"),
     [
         (lambda folder: describe(folder, format=2), "has format 2, this version reads 1"),
-        (lambda folder: describe(folder, mission="formation", env_id=FORMATION), "trained on quad/Formation"),
+        (
+            lambda folder: describe(folder, mission="formation", env_id=FORMATION),
+            "trained on 'quad/Formation",
+        ),
         (lambda folder: describe(folder, digest="0"), "describes other weights"),
         (lambda folder: (folder / "policy.json").write_text("[1"), "is not valid JSON"),
         (lambda folder: (folder / "policy.json").unlink(), "cannot read policy.json"),
@@ -242,6 +245,17 @@ def test_anything_else_is_refused(saved, monkeypatch, tmp_path, spoil, message):
     with pytest.raises(CheckpointError, match=message):
         make_policy(saved, HELIX)
     assert not (tmp_path / "opened").exists()
+
+
+@pytest.mark.parametrize("name", ["format", "squash", "commands", "mission", "features", "digest"])
+@pytest.mark.parametrize("value", ["x" * 100_000, [["y"] * 1000] * 1000, {"z" * 100_000: 1}, None, 10**400])
+def test_odd_descriptions_are_refused_in_a_short_message(saved, name, value):
+    describe(saved, **{name: value})
+    if (name, value) == ("mission", None):
+        return  # of a checkpoint that does not say
+    with pytest.raises(CheckpointError) as said:
+        make_policy(saved, HELIX)
+    assert len(str(said.value).replace(str(saved), "")) < 400
 
 
 @pytest.mark.parametrize("layer", [1, 2])
@@ -298,7 +312,7 @@ def test_a_file_of_another_library_is_not_opened(tmp_path):
 def test_a_folder_that_is_not_there_is_said_to_be_so():
     with pytest.raises(CheckpointError, match="there is no folder 'runs/nowhere'"):
         make_policy("runs/nowhere", HELIX)
-    with pytest.raises(ValueError, match="or the folder of a trained one"):
+    with pytest.raises(ValueError, match="the folder of a trained one"):
         make_policy("nowhere", HELIX)
 
 

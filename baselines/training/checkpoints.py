@@ -18,6 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from quad_envs.names import shown
+
 from ..errors import CheckpointError, ResultsError
 from ..results import write_atomic
 from .networks import Features, Network
@@ -158,8 +160,8 @@ def _read_description(path: Path, where: str) -> dict[str, Any]:
     if not isinstance(described, dict) or described.get("format") != FORMAT:
         found = described.get("format") if isinstance(described, dict) else described
         raise CheckpointError(
-            f"{where} has format {found!r}, this version reads {FORMAT}: train again, or use the version of "
-            "quad-envs that wrote it"
+            f"{where} has format {shown(found)}, this version reads {FORMAT}: train again, or use the "
+            "version of quad-envs that wrote it"
         )
     return described
 

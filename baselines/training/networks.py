@@ -145,7 +145,7 @@ class Network:
         for name, kind in (("squash", Squash), ("commands", Commands)):
             if getattr(self, name) not in get_args(kind):
                 allowed = " or ".join(map(repr, get_args(kind)))
-                raise ValueError(f"{name} of a network must be {allowed}, got {getattr(self, name)!r}")
+                raise ValueError(f"{name} of a network must be {allowed}, got {shown(getattr(self, name))}")
         if not self.weights or len(self.weights) != len(self.biases):
             raise ValueError(
                 f"a network needs as many weights as biases, got {len(self.weights)} and {len(self.biases)}"
