@@ -10,7 +10,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_envs._numba import kernel
+from quad_envs._numba import inline_kernel, kernel
+from quad_envs.parameters import Array
 
 from .rows import first_not_finite
 
@@ -18,25 +19,41 @@ Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 
+@inline_kernel
+def see(observation: Floats, columns: Ints, scaling: Array, out: Floats) -> None:
+    """Write what the first layer sees of an observation; see `forward_rows`."""
+    if scaling.size == 0:
+        for k in range(columns.size):
+            out[k] = observation[columns[k]]
+        return
+    for k in range(columns.size):
+        value = (observation[columns[k]] - scaling[0, k]) / scaling[1, k]
+        out[k] = min(max(value, -scaling[2, k]), scaling[2, k])
+
+
 @kernel
 def forward_rows(
     observations: Floats,
     columns: Ints,
+    scaling: Array,
     sizes: Ints,
     weights: Floats,
-    tanh_last: bool,
+    kinds: NDArray[np.bool_],
     gain: Floats,
     work: Floats,
     out: Floats,
 ) -> int:
-    """Actions of a tanh network.
+    """Actions of a network.
 
     Args:
         observations: (n, d).
         columns: Entries that the network sees, (sizes[0],).
+        scaling: Rows mean, scale, clip, (3, sizes[0]): an entry is (value - mean) / scale, within +-clip; or
+            (0, 0), where the first layer scales.
         sizes: Inputs and outputs of each layer, (layers + 1,).
         weights: Row by row the weights of a layer, then its biases, layer after layer.
-        tanh_last: Whether the outputs pass a tanh, too, before they are clipped to [-1, 1].
+        kinds: Whether layers but the last are relu and not tanh; whether the outputs pass a tanh before they
+            are clipped to [-1, 1], (2,).
         gain: By which positive outputs of the first four are scaled, (4,), see `networks.hover_actions`.
         work: Scratch, (2, max(sizes)).
         out: Result, (n, sizes[-1]).
@@ -45,12 +62,12 @@ def forward_rows(
         -1, or the flat index of the first entry of the observations that is not finite, seen or not.
     """
     layers = sizes.size - 1
+    relu, tanh_last = kinds[0], kinds[1]
     for r in range(observations.shape[0]):
         bad = first_not_finite(observations[r])
         if bad >= 0:
             return int(r * observations.shape[1] + bad)
-        for k in range(columns.size):
-            work[0, k] = observations[r, columns[k]]
+        see(observations[r], columns, scaling, work[0])
         at = 0
         for layer in range(layers):
             n, m = sizes[layer], sizes[layer + 1]
@@ -60,13 +77,16 @@ def forward_rows(
             for i in range(n):
                 for j in range(m):
                     y[j] += x[i] * weights[at + i * m + j]
-            if layer + 1 < layers or tanh_last:
+            if layer + 1 < layers and relu:
+                for j in range(m):
+                    y[j] = max(y[j], np.float32(0.0))
+            elif layer + 1 < layers or tanh_last:
                 for j in range(m):
                     y[j] = math.tanh(y[j])
             at += (n + 1) * m
         for j in range(sizes[layers]):
-            value = min(max(work[layers % 2, j], np.float32(-1.0)), np.float32(1.0))
-            if j < 4 and value > 0.0:
-                value = min(value * gain[j], np.float32(1.0))
-            out[r, j] = value
+            answer = min(max(work[layers % 2, j], np.float32(-1.0)), np.float32(1.0))
+            if j < 4 and answer > 0.0:
+                answer = min(answer * gain[j], np.float32(1.0))
+            out[r, j] = answer
     return -1

@@ -14,7 +14,7 @@ import pytest
 from baselines import CheckpointError, check_policy, evaluate, load_policy, make_policy, shipped_policies
 from baselines.environments import make_env, task_of
 from baselines.training import Network, NetworkPolicy, load_checkpoint, save_checkpoint
-from baselines.training.networks import default_features, hover_actions, hover_outputs, hover_slopes
+from baselines.training.networks import Features, default_features, hover_actions, hover_outputs, hover_slopes
 
 HELIX, FORMATION = "quad/HelixTracking-v0", "quad/Formation-v0"
 ABOUT = {"env_id": HELIX, "mission": "tracking", "algorithm": "apg", "kind": "model-based", "score": 0.5}
@@ -78,6 +78,43 @@ def test_few_rows_get_the_same_as_many(squash, commands):
     one_by_one = np.concatenate([policy.predict(row[None])[0] for row in many])
     assert np.abs(together).max() > 0.5  # and not all on the linear part
     assert np.allclose(together, one_by_one, atol=1e-5)  # other order of sums in float32
+
+
+def relu_network(clip=2.0):
+    """With relu layers, on features that are cut where `clip` says."""
+    plain = network_for(commands="action")
+    seen = replace(plain.features, clip=clip)
+    return replace(plain, features=seen, activation="relu", squash="clip")
+
+
+@pytest.mark.parametrize("clip", [None, 2.0])
+def test_relu_layers_and_cut_features_come_back_and_are_what_they_say(tmp_path, clip):
+    network, task = relu_network(clip), task_of(HELIX)
+    save_checkpoint(tmp_path / "net", network, {"env_id": HELIX})
+    policy, seen = load_policy(tmp_path / "net", HELIX), 3.0 * observations(50)
+    assert policy.network.activation == "relu" and policy.network.features == network.features
+    x = (seen[:, network.features.columns(task.layout)] - network.features.mean) / network.features.scale
+    x = x if clip is None else np.clip(x, -clip, clip)
+    for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
+        x = x @ W + b
+        x = np.maximum(x, 0.0) if k + 1 < len(network.weights) else np.clip(x, -1.0, 1.0)
+    # Products of float32 are rounded: 1e-6 of numbers of order one, a few times over.
+    assert np.abs(policy.predict(seen)[0] - x).max() < 2e-5
+    assert np.abs(np.concatenate([policy.predict(row[None])[0] for row in seen]) - x).max() < 2e-5
+
+
+def test_what_an_older_version_cannot_read_has_another_format(tmp_path):
+    for name, network, expected in (("old", network_for(), 1), ("new", relu_network(None), 2)):
+        save_checkpoint(tmp_path / name, network, {"env_id": HELIX})
+        assert json.loads((tmp_path / name / "policy.json").read_text())["format"] == expected
+
+
+def test_names_of_places_are_for_observations_of_one_size():
+    size = task_of(HELIX).layout.size
+    places = Features(tuple(f"observation[{k}]" for k in range(size)), (0.0,) * size, (1.0,) * size)
+    assert places.columns(task_of(HELIX).layout).tolist() == list(range(size))
+    with pytest.raises(ValueError, match=f"observations of {size} numbers, here they have {size + 3}"):
+        places.columns(task_of("quad/CorridorTracking-v0").layout)
 
 
 @pytest.mark.parametrize("rows", [1, 50])
@@ -205,7 +242,7 @@ def endless(path):
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda folder: describe(folder, format=2), "has format 2, this version reads 1"),
+        (lambda folder: describe(folder, format=3), "has format 3, this version reads 1 to 2"),
         (
             lambda folder: describe(folder, mission="formation", env_id=FORMATION),
             "trained on 'quad/Formation",

@@ -24,7 +24,8 @@ from ..errors import CheckpointError, ResultsError
 from ..results import write_atomic
 from .networks import Features, Network
 
-FORMAT = 1  # rises when an older suite could not read a checkpoint
+FORMAT = 2  # rises when an older suite could not read a checkpoint; 2: relu layers, cut features
+_OLDEST = 1  # that this version reads, and writes where that says all
 WEIGHTS, DESCRIPTION = "network.safetensors", "policy.json"
 _LARGEST = 50_000_000  # bytes; the networks here are a thousandth of it
 _PACKAGES = ("quad-envs", "numpy", "gymnasium", "torch", "stable-baselines3")
@@ -58,8 +59,9 @@ def save_checkpoint(folder: str | Path, network: Network, about: Mapping[str, An
     tensors = {}
     for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
         tensors[f"{k}.weight"], tensors[f"{k}.bias"] = np.ascontiguousarray(W), np.ascontiguousarray(b)
+    plain = network.activation == "tanh" and network.features.clip is None
     described = {
-        "format": FORMAT,
+        "format": _OLDEST if plain else FORMAT,
         "layers": [list(W.shape) for W in network.weights],
         "squash": network.squash,
         "commands": network.commands,
@@ -67,12 +69,14 @@ def save_checkpoint(folder: str | Path, network: Network, about: Mapping[str, An
             "names": list(network.features.names),
             "mean": list(network.features.mean),
             "scale": list(network.features.scale),
+            **({} if plain else {"clip": network.features.clip}),
         },
+        **({} if plain else {"activation": network.activation}),
         "versions": versions(),
         **about,
     }
     # The description carries the digest of its weights: a pair that does not belong together is refused.
-    data = save(tensors, metadata={"format": str(FORMAT)})
+    data = save(tensors, metadata={"format": str(described["format"])})
     described["digest"] = _digest(data)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -117,11 +121,13 @@ def load_checkpoint(folder: str | Path) -> tuple[Network, dict[str, Any]]:
                 tuple(map(str, features["names"])),
                 tuple(map(float, features["mean"])),
                 tuple(map(float, features["scale"])),
+                None if features.get("clip") is None else float(features["clip"]),
             ),
             weights=tuple(tensors[f"{k}.weight"] for k in range(len(tensors) // 2)),
             biases=tuple(tensors[f"{k}.bias"] for k in range(len(tensors) // 2)),
             squash=described["squash"],
             commands=described["commands"],
+            activation=described.get("activation", "tanh"),
         )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise CheckpointError(f"{where} is not a valid network: {error}") from error
@@ -157,11 +163,11 @@ def _read_description(path: Path, where: str) -> dict[str, Any]:
         described = json.loads(_read(path / DESCRIPTION, where))
     except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{where}: {DESCRIPTION} is not valid JSON: {error}") from error
-    if not isinstance(described, dict) or described.get("format") != FORMAT:
+    if not isinstance(described, dict) or described.get("format") not in range(_OLDEST, FORMAT + 1):
         found = described.get("format") if isinstance(described, dict) else described
         raise CheckpointError(
-            f"{where} has format {shown(found)}, this version reads {FORMAT}: train again, or use the "
-            "version of quad-envs that wrote it"
+            f"{where} has format {shown(found)}, this version reads {_OLDEST} to {FORMAT}: train again, or "
+            "use the version of quad-envs that wrote it"
         )
     return described
 

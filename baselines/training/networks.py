@@ -25,10 +25,12 @@ from ..rows import as_rows, as_starts, not_finite, state_of
 
 Floats = NDArray[np.float32]
 Squash = Literal["tanh", "clip"]
+Activation = Literal["tanh", "relu"]
 Commands = Literal["hover", "action"]
 
 # Preview stages that a network sees: near ones densely, the horizon of the MPCs at the end.
 TRACKING_STAGES = (0, 1, 2, 3, 5, 7, 10, 14, 19, 25)
+PLACES = ("observation[0]",)  # how names of places begin, see `Features`
 _FEW = 4  # rows up to which the compiled form is faster
 _LARGEST_SEEN = 1e6  # SI, of an observation for which layers must not overflow
 _forward = entry_of(forward_rows)
@@ -58,12 +60,14 @@ _ROW_SCALES = {
 class Features:
     """Which entries of an observation a network sees, and how they are scaled: (obs - mean) / scale.
 
-    The entries are named, so that a network for 25 preview stages can fly where there are 30.
+    The entries are named, so that a network for 25 preview stages can fly where there are 30. Names
+    "observation[0]", "observation[1]", ... are places: of these a network sees all, where there are as many.
     """
 
     names: tuple[str, ...]  # "V_B[0]", "preview[5][2]", ...: part, then index in the part
     mean: tuple[float, ...]
     scale: tuple[float, ...]
+    clip: float | None = None  # largest size of what is scaled, as VecNormalize cuts it; None for none
 
     def columns(self, layout: TrackingLayout | AgentLayout) -> NDArray[np.int64]:
         """Indices in an observation of this layout.
@@ -71,6 +75,13 @@ class Features:
         Raises:
             ValueError: If the layout lacks an entry; the message names it.
         """
+        if self.names[:1] == PLACES[:1]:
+            if len(self.names) != layout.size:
+                raise ValueError(
+                    f"the network sees observations of {len(self.names)} numbers, here they have "
+                    f"{layout.size}: evaluate it in a task with the layout it was trained on"
+                )
+            return np.arange(layout.size)
         known = {name: k for k, name in enumerate(entry_names(layout))}
         missing = [name for name in self.names if name not in known]
         if missing:
@@ -128,7 +139,7 @@ def default_features(layout: TrackingLayout | AgentLayout, stages: tuple[int, ..
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Network:
-    """Tanh layers over features, a linear layer, and what its outputs command.
+    """Layers over features, tanh or relu, a linear layer, and what its outputs command.
 
     Raises:
         ValueError: If the shapes do not fit together, a number is not finite, or a layer, the first with its
@@ -140,9 +151,10 @@ class Network:
     biases: tuple[Floats, ...]  # each (outputs,)
     squash: Squash = "tanh"  # how outputs come into [-1, 1]
     commands: Commands = "hover"  # "hover": outputs are u_T (1 + output); "action": they are the actions
+    activation: Activation = "tanh"  # of all layers but the last
 
     def __post_init__(self) -> None:
-        for name, kind in (("squash", Squash), ("commands", Commands)):
+        for name, kind in (("squash", Squash), ("commands", Commands), ("activation", Activation)):
             if getattr(self, name) not in get_args(kind):
                 allowed = " or ".join(map(repr, get_args(kind)))
                 raise ValueError(f"{name} of a network must be {allowed}, got {shown(getattr(self, name))}")
@@ -171,15 +183,19 @@ class Network:
                     f"mean and scale of a network's feature {shown(name)} must be finite, the scale > 0, got "
                     f"{mean!r} and {scale!r}"
                 )
+        clip = self.features.clip
+        if clip is not None and not (np.isfinite(clip) and clip > 0.0):
+            raise ValueError(f"clip of a network's features must be finite and > 0, got {clip!r}")
         self._check_overflow()
 
     def _check_overflow(self) -> None:
         """Refuse layers whose sums could leave float32 for observations up to _LARGEST_SEEN."""
         most, seen = float(np.finfo(np.float32).max), self.features
+        bound = _LARGEST_SEEN if seen.clip is None else seen.clip
         for k, (W, b) in enumerate(self.layers()):
-            bound = 1.0 if k else _LARGEST_SEEN
             reach = bound * np.abs(W.astype(np.float64)).sum(axis=0) + np.abs(b.astype(np.float64))
             if np.all(reach < most):
+                bound = 1.0 if self.activation == "tanh" else float(reach.max())
                 continue
             worst = int(np.argmax((_LARGEST_SEEN + np.abs(seen.mean)) / np.asarray(seen.scale)))
             of = f"layer {k} of a network"
@@ -189,7 +205,12 @@ class Network:
             raise ValueError(f"float32 cannot hold the sums of {of}")
 
     def layers(self) -> list[tuple[Floats, Floats]]:
-        """Weights and biases for observations as they are: scaling is a part of the first layer."""
+        """Weights and biases for observations as they are: scaling is a part of the first layer.
+
+        With `features.clip` they are for scaled observations: a cut is not linear.
+        """
+        if self.features.clip is not None:
+            return list(zip(self.weights, self.biases, strict=True))
         scale = np.asarray(self.features.scale, dtype=np.float64)
         mean = np.asarray(self.features.mean, dtype=np.float64)
         with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is looked at
@@ -265,6 +286,8 @@ class NetworkPolicy:
         self._layers = network.layers()
         self._sizes = np.array([len(self._columns), *(len(b) for _, b in self._layers)], dtype=np.int64)
         self._flat = np.concatenate([part.reshape(-1) for layer in self._layers for part in layer])
+        self._scaling = _scaling(network.features)
+        self._kinds = np.array([network.activation == "relu", network.squash == "tanh"])
         hover = network.commands == "hover"
         self._gain = _hover_gain(task, np.float32) if hover else np.ones(4, dtype=np.float32)
 
@@ -298,8 +321,8 @@ class NetworkPolicy:
         """Without the cost of calling numpy."""
         out = np.empty((len(obs), self._sizes[-1]), dtype=np.float32)
         work = np.empty((2, self._sizes.max()), dtype=np.float32)
-        squash = self.network.squash == "tanh"
-        bad = _forward(obs, self._columns, self._sizes, self._flat, squash, self._gain, work, out)
+        layers = self._sizes, self._flat, self._kinds
+        bad = _forward(obs, self._columns, self._scaling, *layers, self._gain, work, out)
         if bad >= 0:
             raise not_finite(obs, bad, self.task.layout.slices)
         return out
@@ -310,13 +333,25 @@ class NetworkPolicy:
         if not finite.all():
             raise not_finite(obs, int(np.argmin(finite)), self.task.layout.slices)
         x = obs[:, self._columns]
+        if len(self._scaling):
+            mean, scale, clip = self._scaling
+            x = np.clip((x - mean) / scale, -clip, clip).astype(np.float32)
         for k, (W, b) in enumerate(self._layers):
             x = x @ W
             x += b
-            if k + 1 < len(self._layers) or self.network.squash == "tanh":
+            if k + 1 < len(self._layers) and self.network.activation == "relu":
+                np.maximum(x, 0.0, out=x)
+            elif k + 1 < len(self._layers) or self.network.squash == "tanh":
                 np.tanh(x, out=x)
         np.clip(x, -1.0, 1.0, out=x)
         return hover_actions(x, self.task) if self.network.commands == "hover" else x
+
+
+def _scaling(features: Features) -> Array:
+    """Rows mean, scale, clip, (3, entries), of what the first layer does not scale; (0, 0) for none."""
+    if features.clip is None:
+        return np.zeros((0, 0))
+    return np.array([features.mean, features.scale, [features.clip] * len(features.names)])
 
 
 @lru_cache(maxsize=64)

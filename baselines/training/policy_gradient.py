@@ -62,10 +62,11 @@ class Actor:
         import torch
 
         shapes = [tuple(layer.weight.shape[::-1]) for layer in self.layers]
-        if [W.shape for W in network.weights] != shapes or network.squash != self.squash:
+        kinds, own = (network.squash, network.activation), (self.squash, "tanh")
+        if [W.shape for W in network.weights] != shapes or kinds != own:
             raise ValueError(
-                f"cannot go on from layers {[W.shape for W in network.weights]} ({network.squash}) with "
-                f"layers {shapes} ({self.squash}): give the same hidden sizes and squash"
+                f"cannot go on from layers {[W.shape for W in network.weights]} ({', '.join(kinds)}) with "
+                f"layers {shapes} ({', '.join(own)}): give the same hidden sizes and squash"
             )
         if network.features != features:
             raise ValueError(

@@ -218,10 +218,12 @@ def take_over(model: PPO | SAC, network: Network) -> None:
     wanted = [(layer.in_features, layer.out_features) for layer in layers]
     found = [tuple(W.shape) for W in network.weights]
     squash = "tanh" if isinstance(model, SAC) else "clip"
-    if found != wanted or network.squash != squash or network.commands != "hover":
+    kinds = network.squash, network.commands, network.activation
+    if found != wanted or kinds != (squash, "hover", "tanh"):
         raise ValueError(
-            f"the network has layers {found} and squash {network.squash!r}, this training {wanted} and "
-            f"{squash!r}: go on with the algorithm and the hidden layers that made it"
+            f"the network has layers {found}, squash, commands and activation {kinds}, this training "
+            f"{wanted} and {(squash, 'hover', 'tanh')}: go on with the algorithm and the hidden layers that "
+            "made it"
         )
     with torch.no_grad():
         for layer, W, b in zip(layers, network.weights, network.biases, strict=True):
