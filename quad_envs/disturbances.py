@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .authority import hover_authority
-from .kinds import as_tuple, is_number, make_kind, refuse_class
+from .kinds import as_tuple, is_number, make_kind, refuse_class, without_booleans
 from .names import shown, unknown_name
 from .parameters import Array, Limits, QuadrotorParams
 
@@ -243,7 +243,8 @@ def make_disturbance(what: DisturbanceLike) -> Disturbance | None:
         return None
     refuse_class("disturbance", what)
     if isinstance(what, Disturbance):
-        return what
+        checked: Disturbance = without_booleans("disturbance", what, DISTURBANCES)
+        return checked
     if isinstance(what, str):
         if what in DISTURBANCES:
             return DISTURBANCES[what]

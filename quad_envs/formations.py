@@ -12,15 +12,22 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .names import unknown_name
+from .checks import Bound, require_number, require_whole
+from .kinds import holds_booleans
+from .names import shown, unknown_name
 from .parameters import Array
 
 FORMATIONS = ("triangle", "hexagon", "lattice")
 STARTS = ("line", "sorted", "random", "box")
-_START_GAP = 1.0  # m, between neighbours of a named start
+MOST_VEHICLES = 200
+FARTHEST = 1e6  # m, from the origin; float32 observations hold it
+_SPACING = Bound(0.0, 1e4, "m", open=True)
+START_GAP = 1.0  # m, between neighbours of a named start
 _START_HEIGHT_NOISE = 0.02  # m, breaks the symmetry of a plane
 _SAME_PLACE = 1e-6  # m, vehicles nearer than this have no direction in which to part
-_MOST_DRAWS = 10_000  # of positions per start; a box with 1 m^3 a vehicle needs about one each
+_MOST_DRAWS = 100_000  # of positions per start; a box with 1 m^3 a vehicle needs about one each
+_TRIES, _TRIED_DRAWS = 5, 10_000  # with which a box has to be filled before the first episode
+_JAMMED = 1000  # misses in a row after which the box is filled anew
 
 
 def lattice_cells(n: int) -> list[tuple[int, int]]:
@@ -51,10 +58,8 @@ def make_formation(
         ValueError: If the name is unknown, the number of vehicles does not fit, slots are not finite, or two
             of them are too near each other.
     """
-    if isinstance(vehicles, bool) or not isinstance(vehicles, int | np.integer) or vehicles < 1:
-        raise ValueError(f"vehicles must be an integer >= 1, got {vehicles!r}")
-    if not (math.isfinite(spacing) and spacing > 0.0):
-        raise ValueError(f"spacing of a formation must be a finite number > 0 m, got {spacing!r}")
+    require_whole("vehicles", vehicles, 1, MOST_VEHICLES)
+    require_number("spacing of a formation", spacing, _SPACING)
     if isinstance(what, str):
         slots = spacing * _named_slots(what, int(vehicles))
         remedy = "choose a larger spacing"
@@ -98,15 +103,20 @@ def _positions(name: str, what: ArrayLike, n: int) -> Array:
     """Finite positions (n, 3) from what a user gave."""
     try:
         out = np.array(what, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} must be a name or {n} rows of three numbers, got {what!r}") from None
+    except (TypeError, ValueError, OverflowError):
+        out = None
+    if out is None or holds_booleans(what):
+        raise ValueError(f"{name} must be a name or {n} rows of three numbers, got {shown(what)}") from None
     if out.shape != (n, 3):
         raise ValueError(
             f"{name} must be a name or an ({n}, 3) array, one row per vehicle, got shape {out.shape}"
         )
-    if not np.isfinite(out).all():
-        row = int(np.argmin(np.isfinite(out).all(axis=1)))
-        raise ValueError(f"{name} must be finite, got {out[row].tolist()} for vehicle {row}")
+    near = np.abs(out) <= FARTHEST
+    if not near.all():
+        row = int(np.argmin(near.all(axis=1)))
+        raise ValueError(
+            f"{name} must be finite and within {FARTHEST:g} m, got {out[row].tolist()} for vehicle {row}"
+        )
     return out
 
 
@@ -119,7 +129,11 @@ def nearest_pair(p: Array) -> tuple[int, int, float]:
 
 
 def start_positions(
-    kind: str | ArrayLike, slots: Array, rng: np.random.Generator, separation: float = 0.4
+    kind: str | ArrayLike,
+    slots: Array,
+    rng: np.random.Generator,
+    separation: float = 0.4,
+    draws: int = _MOST_DRAWS,
 ) -> Array:
     """First positions of a team, at rest.
 
@@ -130,6 +144,7 @@ def start_positions(
         slots: p_i*, (N, 3), m.
         rng: Read by "random" and "box" only.
         separation: Distance that two vehicles of a "box" must exceed, m.
+        draws: After so many of a "box" it has no room.
 
     Returns:
         p_i(0), (N, 3), m.
@@ -148,17 +163,30 @@ def start_positions(
                 f"vehicles {i} and {j} start at the same place {out[i].tolist()}: move them apart"
             )
     elif kind == "line":
-        out[:, 1] = _START_GAP * np.arange(n)
+        out[:, 1] = START_GAP * np.arange(n)
     elif kind == "sorted":
-        out[:, 1] = _START_GAP * _ranks_from_leader(slots)
+        out[:, 1] = START_GAP * _ranks_from_leader(slots)
     elif kind == "random":
         out = _grid(n)[rng.permutation(n)]
         out[:, 2] = _START_HEIGHT_NOISE * rng.standard_normal(n)
     elif kind == "box":
-        out = _box(n, rng, separation)
+        out = _box(n, rng, separation, draws)
     else:
         raise ValueError(f"{unknown_name('start', kind, STARTS)}, or an (N, 3) array of positions")
     return out
+
+
+def tried_starts(kind: str | ArrayLike, slots: Array, separation: float) -> list[Array]:
+    """Starts as `start_positions` draws them, with so few draws that no later one fails.
+
+    Raises:
+        ValueError: As there.
+    """
+    tries = _TRIES if isinstance(kind, str) and kind == "box" else 1
+    return [
+        start_positions(kind, slots, np.random.default_rng(seed), separation, _TRIED_DRAWS)
+        for seed in range(tries)
+    ]
 
 
 def _ranks_from_leader(slots: Array) -> Array:
@@ -177,20 +205,24 @@ def _grid(n: int) -> Array:
     """First n places of a square grid, row by row from north to south, centred in y, (n, 3)."""
     side = math.isqrt(n - 1) + 1
     row, column = np.divmod(np.arange(n), side)
-    return _START_GAP * np.stack([-row, column - 0.5 * (side - 1), np.zeros(n)], axis=1)
+    return START_GAP * np.stack([-row, column - 0.5 * (side - 1), np.zeros(n)], axis=1)
 
 
-def _box(n: int, rng: np.random.Generator, separation: float) -> Array:
+def _box(n: int, rng: np.random.Generator, separation: float, draws: int) -> Array:
     """Places in a cube, each drawn again until it is far enough from those before it, (n, 3)."""
-    half = 0.5 * _START_GAP * n ** (1.0 / 3.0)
+    half = 0.5 * START_GAP * n ** (1.0 / 3.0)
     out = np.empty((n, 3))
-    placed = 0
-    for _ in range(_MOST_DRAWS + n):
+    placed = missed = 0
+    for _ in range(draws + n):
         out[placed] = rng.uniform(-half, half, 3)
         if (np.linalg.norm(out[:placed] - out[placed], axis=1) > separation).all():
-            placed += 1
+            placed, missed = placed + 1, 0
             if placed == n:
                 return out
+        elif missed == _JAMMED:
+            placed = missed = 0
+        else:
+            missed += 1
     raise ValueError(
         f"no room for {n} vehicles more than {separation:g} m apart in a box of {2.0 * half:.2f} m: lower "
         "the separation or start from 'random' or an (N, 3) array"

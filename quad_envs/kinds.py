@@ -17,14 +17,21 @@ from .names import shown, unknown_name
 
 Kinds: TypeAlias = Mapping[str, Any]
 Parts: TypeAlias = Mapping[str, Callable[[Any], Any]]
+DEEPEST = 20  # lists and mappings in each other
 _NUMBERS = (int, float, np.integer, np.floating)
 
 
-def as_tuple(value: Any) -> Any:
-    """Lists and arrays from configuration files and the command line become tuples."""
+def as_tuple(value: Any, depth: int = 0) -> Any:
+    """Lists and arrays from configuration files and the command line become tuples.
+
+    Raises:
+        ValueError: If they are nested deeper than anything that is asked for.
+    """
+    if depth > DEEPEST:
+        raise ValueError(f"a value has lists in each other, more than {DEEPEST} deep")
     if isinstance(value, np.ndarray):
         value = value.tolist()
-    return tuple(as_tuple(entry) for entry in value) if isinstance(value, list | tuple) else value
+    return tuple(as_tuple(entry, depth + 1) for entry in value) if isinstance(value, list | tuple) else value
 
 
 def make_kind(what: str, given: Mapping[str, Any], kinds: Kinds, parts: Parts | None = None) -> Any:
@@ -56,7 +63,7 @@ def make_kind(what: str, given: Mapping[str, Any], kinds: Kinds, parts: Parts | 
         values[key] = parts[key](value) if parts and key in parts else as_tuple(value)
         _require_alike(f"{key} of the {what} {name!r}", values[key], _default(entry, known[key]))
     try:
-        return _made(what, name, entry, values)
+        return without_booleans(what, _made(what, name, entry, values), kinds)
     except TypeError as error:
         raise ValueError(f"the {what} {name!r} cannot be made of {shown(values)}: {error}") from None
 
@@ -72,6 +79,23 @@ def _made(what: str, name: str, entry: Any, values: Mapping[str, Any]) -> Any:
             f"the {what} {name!r} needs {', '.join(missing)}, as {{'kind': {name!r}, {missing[0]!r}: ...}}"
         )
     return entry(**values)
+
+
+def without_booleans(what: str, value: Any, kinds: Kinds) -> Any:
+    """The value, of one of the kinds or not, in which no True or False stands for a number.
+
+    Raises:
+        ValueError: If one does.
+    """
+    known = [entry if isinstance(entry, type) else type(entry) for entry in kinds.values()]
+    if type(value) in known:
+        for one in _init_fields(value).values():
+            if not isinstance(one.default, bool) and holds_booleans(getattr(value, one.name)):
+                raise ValueError(
+                    f"{one.name} of the {what} {type(value).__name__} must be numbers, "
+                    f"got {shown(getattr(value, one.name))}"
+                )
+    return value
 
 
 def refuse_class(what: str, value: Any) -> None:
@@ -140,3 +164,15 @@ def is_number(value: Any) -> bool:
         return math.isfinite(value)
     except OverflowError:  # an integer beyond all floats
         return False
+
+
+def is_limit(value: Any) -> bool:
+    """Whether it is a number, or infinite for no limit."""
+    return is_number(value) or (isinstance(value, float | np.floating) and math.isinf(value))
+
+
+def holds_booleans(value: Any) -> bool:
+    """Whether True or False stands where numbers are asked, in an array or in nested lists of them."""
+    if isinstance(value, list | tuple):
+        return any(map(holds_booleans, value))
+    return isinstance(value, bool | np.bool_) or getattr(value, "dtype", None) == np.bool_

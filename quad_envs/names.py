@@ -4,11 +4,34 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from reprlib import Repr
+
+_MOST_DIGITS = 40
+
+
+class _Short(Repr):
+    """Reprs that are quick to make, whatever the value: of long or deep ones only the beginning is read."""
+
+    def __init__(self, most: int) -> None:
+        super().__init__()
+        self.maxlevel = 6
+        self.maxdict = self.maxlist = self.maxtuple = self.maxset = self.maxfrozenset = self.maxdeque = most
+        self.maxstring = self.maxother = 4 * most
+
+    def repr_str(self, x: str, level: int) -> str:
+        return repr(x[: 2 * self.maxstring])
+
+    def repr_int(self, x: int, level: int) -> str:
+        digits = int(x.bit_length() * 0.30103) + 1
+        return repr(x) if digits <= _MOST_DIGITS else f"an integer of about {digits} digits"
 
 
 def shown(value: object, most: int = 80) -> str:
-    """The repr of a value, cut where it is longer than a message should be."""
-    text = repr(value[: 2 * most] if isinstance(value, str | bytes | tuple | list) else value)
+    """The repr of a value, cut where it is longer than a message should be, on one line."""
+    try:
+        text = " ".join(_Short(most).repr(value).split())
+    except Exception:  # of somebody else's class
+        text = f"a {type(value).__name__}"
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 

@@ -8,6 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .checks import Bound, require_number
+from .kinds import is_limit, is_number
+from .names import shown
+
 Array = NDArray[np.float64]
 
 N_STATE = 12  # [p, V_B, Theta, Omega]
@@ -43,9 +47,40 @@ FRAMES = {"plus": 0.0, "x": math.pi / 4.0}  # delta, rad: from the x axis to the
 MOST_KAPPA = 20.0  # thrust-to-weight 80, beyond any vehicle; the dissertation has 1
 
 
-def _require_positive(name: str, value: float, unit: str) -> None:
-    if not (math.isfinite(value) and value > 0.0):
-        raise ValueError(f"{name} must be a finite number > 0 {unit}, got {value!r}")
+_FLYING = "no multicopter, from the smallest robot insects to air taxis on any planet, is beyond"
+# What a parameter may be; beyond, numbers overflow or vanish in the equations of motion.
+_BOUNDS = {
+    "mass": Bound(1e-5, 1e5, "kg", _FLYING),
+    "gravity": Bound(1e-3, 1e3, "m/s^2", _FLYING),
+    "arm": Bound(1e-4, 1e2, "m", _FLYING),
+    "yaw_moment": Bound(1e-7, 1e1, "m", _FLYING),
+    "rotor_rate": Bound(1e-2, 1e5, "1/s", "a rotor answers within microseconds to minutes"),
+    "drag": Bound(0.0, 1e5, "kg/s", _FLYING),
+}
+_MOMENT = Bound(1e-12, 1e6, "kg m^2", _FLYING)
+_ROUNDING = 1e-9  # relative, of principal moments that are given as decimals
+LEAST_LIMIT = 1e-6  # SI; below, the relative size of a violation means nothing
+MOST_WEIGHT = 1e15  # of Q and R; beyond, the cost of a flight leaves the numbers
+_LEAST_WEIGHT = 1e-15  # of R
+
+
+def require_inertia(inertia: tuple[float, float, float]) -> None:
+    """Check that a body can have these principal moments (Jx, Jy, Jz), kg m^2.
+
+    They are integrals of y^2 + z^2, x^2 + z^2 and x^2 + y^2: none exceeds the sum of the others.
+
+    Raises:
+        ValueError: If no body can.
+    """
+    total = sum(inertia)
+    for axis, moment in zip("xyz", inertia, strict=True):
+        others = total - moment
+        if moment > others * (1.0 + _ROUNDING):
+            a, b = (name for name in "xyz" if name != axis)
+            raise ValueError(
+                f"inertia {tuple(inertia)!r} kg m^2 is that of no body: J{axis} = {moment:g} exceeds J{a} + "
+                f"J{b} = {others:g} (a flat plate has equality); look at the order (Jx, Jy, Jz) and the units"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +92,8 @@ class QuadrotorParams:
     Rotors 1 and 3 turn clockwise, and their drag turns the body the other way.
 
     Raises:
-        ValueError: If a parameter is not finite or not positive (drag may be zero), or the frame is unknown.
+        ValueError: If a parameter is no number, or beyond every vehicle (drag may be zero), no body can have
+            the inertia, or the frame is unknown.
     """
 
     mass: float = 0.8  # kg
@@ -70,20 +106,14 @@ class QuadrotorParams:
     frame: str = "plus"  # or "x"
 
     def __post_init__(self) -> None:
-        for name, unit in (
-            ("mass", "kg"),
-            ("gravity", "m/s^2"),
-            ("arm", "m"),
-            ("yaw_moment", "m"),
-            ("rotor_rate", "1/s"),
-        ):
-            _require_positive(name, float(getattr(self, name)), unit)
-        if len(self.inertia) != 3:
-            raise ValueError(f"inertia needs three principal moments (Jx, Jy, Jz), got {self.inertia!r}")
+        for name, bound in _BOUNDS.items():
+            require_number(name, getattr(self, name), bound)
+        given = self.inertia if isinstance(self.inertia, tuple | list) else ()
+        if len(given) != 3 or not all(map(is_number, given)):
+            raise ValueError(f"inertia must be three numbers (Jx, Jy, Jz), kg m^2, got {shown(self.inertia)}")
         for axis, moment in zip("xyz", self.inertia, strict=True):
-            _require_positive(f"inertia J{axis}", float(moment), "kg m^2")
-        if not (math.isfinite(self.drag) and self.drag >= 0.0):
-            raise ValueError(f"drag must be a finite number >= 0 kg/s, got {self.drag!r}")
+            require_number(f"inertia J{axis}", moment, _MOMENT)
+        require_inertia(self.inertia)
         if self.frame not in FRAMES:
             raise ValueError(f"frame must be one of {', '.join(map(repr, FRAMES))}, got {self.frame!r}")
 
@@ -171,7 +201,7 @@ class Limits:
         if len(self.kappas) != N_INPUT:
             raise ValueError(f"kappa must be one number or one per rotor, got {self.kappa!r}")
         for i, kappa in enumerate(self.kappas):
-            if not 0.25 < kappa <= MOST_KAPPA:
+            if not (is_number(kappa) and 0.25 < kappa <= MOST_KAPPA):
                 which = f" for rotor {i + 1}" if isinstance(self.kappa, tuple) else ""
                 raise ValueError(
                     "kappa, the largest rotor force as a fraction of the weight, must lie in "
@@ -180,15 +210,23 @@ class Limits:
                 )
         for name, unit in (("rate", "N/s"), ("tilt", "rad"), ("velocity", "m/s")):
             value = getattr(self, name)
-            if math.isnan(value) or value <= 0.0:
-                raise ValueError(f"{name} limit must be > 0 {unit} (math.inf for none), got {value!r}")
+            if not (is_limit(value) and value > 0.0):
+                raise ValueError(f"{name} limit must be > 0 {unit} (math.inf for none), got {shown(value)}")
+            if value < LEAST_LIMIT:
+                raise ValueError(
+                    f"{name} limit must be at least {LEAST_LIMIT:g} {unit}, so that a violation can be told "
+                    f"from rounding, got {shown(value)}"
+                )
         if math.isfinite(self.tilt) and self.tilt >= math.pi / 2:
             raise ValueError(f"tilt limit must be below pi/2 rad (math.inf for none), got {self.tilt!r}")
         if len(self.position_lower) != 3 or len(self.position_upper) != 3:
             raise ValueError("position limits need three numbers (x, y, z), m")
         for axis, low, high in zip("xyz", self.position_lower, self.position_upper, strict=True):
-            if math.isnan(low) or math.isnan(high) or not low < high:
-                raise ValueError(f"position limit on {axis} needs lower < upper, got [{low!r}, {high!r}] m")
+            if not (is_limit(low) and is_limit(high) and low < high):
+                raise ValueError(
+                    f"position limit on {axis} needs numbers lower < upper, got [{shown(low)}, "
+                    f"{shown(high)}] m"
+                )
 
     @property
     def kappas(self) -> tuple[float, ...]:
@@ -217,10 +255,15 @@ class Weights:
             raise ValueError(
                 f"weights need {N_STATE} entries in Q and {N_INPUT} in R, got {len(self.Q)} and {len(self.R)}"
             )
-        if not all(math.isfinite(q) and q >= 0.0 for q in self.Q):
-            raise ValueError(f"weights Q must be finite and >= 0, got {self.Q!r}")
-        if not all(math.isfinite(r) and r > 0.0 for r in self.R):
-            raise ValueError(f"weights R must be finite and > 0, got {self.R!r}")
+        if not all(is_number(q) and 0.0 <= q <= MOST_WEIGHT for q in self.Q):
+            raise ValueError(
+                f"weights Q must be finite, >= 0 and at most {MOST_WEIGHT:g}, got {shown(self.Q)}"
+            )
+        if not all(is_number(r) and _LEAST_WEIGHT <= r <= MOST_WEIGHT for r in self.R):
+            raise ValueError(
+                f"weights R must be finite and > 0, from {_LEAST_WEIGHT:g} to {MOST_WEIGHT:g}, "
+                f"got {shown(self.R)}"
+            )
 
     def Q_matrix(self) -> Array:
         """Q, (12, 12)."""

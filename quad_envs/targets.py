@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .kinds import make_kind, refuse_class
+from .kinds import make_kind, refuse_class, without_booleans
 from .names import shown, unknown_name
 from .parameters import Array
 from .references import (
@@ -295,7 +295,8 @@ def make_target(what: Any) -> Target:
     """
     refuse_class("target", what)
     if isinstance(what, StaticTarget | ConstantVelocity | TurningTarget | Aircraft | PathTarget):
-        return what
+        checked: Target = without_booleans("target", what, TARGETS)
+        return checked
     if isinstance(what, Target):
         return PathTarget(what)
     if isinstance(what, str) and what in _KINDS:

@@ -105,7 +105,7 @@ def test_vectors_and_environments_made_by_hand_take_the_steps_too():
 
 @pytest.mark.parametrize("steps", [0, 2.5, "many"])
 def test_steps_that_are_none_are_refused(steps):
-    with pytest.raises(ValueError, match="max_episode_steps must be an integer >= 1"):
+    with pytest.raises(ValueError, match="max_episode_steps must be a whole number >= 1"):
         gym.make_vec(HELIX, num_envs=2, max_episode_steps=steps)
 
 

@@ -120,7 +120,7 @@ def test_make_env_says_what_is_wrong_as_for_single_vehicles():
         make_env(FORMATION, grph="weak")
     with pytest.raises(ValueError, match="did you mean 'quad/Formation-v0'"):
         make_env("quad/Formations-v0")
-    with pytest.raises(ValueError, match="vehicles must be an integer"):
+    with pytest.raises(ValueError, match="vehicles must be a whole number"):
         make_env(FORMATION, vehicles=0)
 
 

@@ -355,9 +355,10 @@ def test_step_before_reset_is_refused():
 
 
 def test_a_start_that_is_lost_already_is_refused():
-    env = make(start=(100.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="beyond lost_distance"):
-        env.reset(seed=0)
+        make(start=(100.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="beyond lost_distance"):
+        make().reset(seed=0, options={"state": [100.0] + [0.0] * 11})
 
 
 class _Wrong:

@@ -175,5 +175,5 @@ def test_step_before_reset_is_refused():
 
 @pytest.mark.parametrize("n", [0, -1])
 def test_an_empty_vector_is_refused(n):
-    with pytest.raises(ValueError, match="num_envs must be >= 1"):
+    with pytest.raises(ValueError, match="num_envs must be a whole number >= 1"):
         gym.make_vec("quad/HelixTracking-v0", num_envs=n)

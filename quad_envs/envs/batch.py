@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._numba import entry_of
+from ..checks import array_bytes, require_memory
 from ..disturbances import Disturbance
+from ..names import shown
 from ..parameters import N_STATE, POSITION, Array
 from ..references import Reference, make_reference, state_on
 from ..turning import N_TABLE
@@ -40,31 +42,40 @@ class TrackingBatch:
 
     def __init__(self, options: TrackingOptions, n: int) -> None:
         self.options, self.n, self.task = options, n, options.task
-        self.rows: Array = np.zeros((n, ROW_SIZE))
-        self._vector = task_vector(self.task, options.substeps, options.lost_distance)
         self._reference: Reference = make_reference(options.reference)
         self._disturbance: Disturbance | None = options.make_disturbance()
-        self._randomization = options.randomization()
-        self._start, self._widths = options.start_state(), options.start_half_widths()
-        steps, dt = self.task.episode_steps, self.task.dt
-        self._times: Array = dt * np.arange(steps + 1 + self.task.layout.preview, dtype=np.float64)
-        self._nodes = stage_times(self.task, options.substeps)
         self._noise = np.repeat(np.asarray(self.task.sensor_noise), 3)
         # A table that is the same in every episode is stored once.
-        never = np.random.default_rng(0)
         random = (
             self._reference.random,
             self._disturbance is not None and self._disturbance.random,
             bool(self._noise.any()),
         )
         count = [n if is_random else 1 for is_random in random]
-        self.references: Array = np.zeros((count[0], self._times.size, N_TABLE))
-        self.disturbances: Array = np.zeros(
-            (count[1], steps if self._disturbance else 0, self._nodes.shape[1], 6)
+        steps, dt, nodes = self.task.episode_steps, self.task.dt, 2 * options.substeps + 1
+        references = (count[0], steps + 1 + self.task.layout.preview, N_TABLE)
+        disturbances = (count[1], steps if self._disturbance else 0, nodes, 6)
+        noises = (count[2], steps + 1 if random[2] else 0, N_STATE)
+        seen = (n, self.task.layout.size)
+        require_memory(
+            f"{shown(n)} flights of {steps} steps",
+            array_bytes((n, ROW_SIZE), references, disturbances, noises, (steps, nodes), seen),
+            "choose fewer of them, shorter ones, a shorter preview, or fewer substeps",
         )
-        self.noises: Array = np.zeros((count[2], steps + 1 if random[2] else 0, N_STATE))
+        self.rows: Array = np.zeros((n, ROW_SIZE))
+        self._vector = task_vector(self.task, options.substeps, options.lost_distance)
+        self._randomization = options.randomization()
+        self._start, self._widths = options.start_state(), options.start_half_widths()
+        self._times: Array = dt * np.arange(references[1], dtype=np.float64)
+        self._nodes = stage_times(self.task, options.substeps)
+        never = np.random.default_rng(0)
+        self.references: Array = np.zeros(references)
+        self.disturbances: Array = np.zeros(disturbances)
+        self.noises: Array = np.zeros(noises)
+        first = reference_rows(self._reference, self._times, never)  # of a random one, to see that it works
+        options.require_near(first[0, POSITION])
         if not random[0]:
-            self.references[0] = reference_rows(self._reference, self._times, never)
+            self.references[0] = first
         if self._disturbance is not None and not random[1]:
             self.disturbances[0] = disturbance_rows(self._disturbance, self._nodes, dt, never)
         self._random = random

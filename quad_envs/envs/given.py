@@ -7,15 +7,19 @@ from typing import Any
 
 import numpy as np
 
+from ..formations import FARTHEST
+from ..kinds import holds_booleans
 from ..names import shown
 from ..parameters import N_INPUT, N_STATE, Array
 from .vehicle_options import CRASH_TILT
 
-MOST_STATE = 1e6  # SI; farther and faster than that nothing flies, and float32 observations hold it
+MOST_STATE = FARTHEST  # SI; faster than that nothing flies, either
 
 
 def as_numbers(state: Any) -> Array:
     """An array of what was given; (0,) where it is ragged or no numbers."""
+    if holds_booleans(state):
+        return np.empty(0)
     try:
         return np.asarray(state, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):

@@ -6,7 +6,6 @@ Everything that comes from a user's object is checked here, so that the compiled
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from ..parameters import Array
 from ..references import Reference, too_fast
 from ..tasks import BaseTask
 from ..turning import with_turn_rates
+from .vehicle_options import varied_params
 
 
 def reference_rows(reference: Reference, times: Array, rng: np.random.Generator) -> Array:
@@ -80,12 +80,10 @@ def draw_vehicle(
     """Coefficients and rotor saturation (4,) of a true vehicle; without randomization nothing is drawn."""
     params, force_max = task.params, task.force_max
     if randomization:
-        change = {
+        factors = {
             name: 1.0 + spread * rng.uniform(-1.0, 1.0, 3 if name == "inertia" else None)
             for name, spread in randomization.items()
         }
-        force_max *= float(change.pop("kappa", 1.0))
-        inertia = np.asarray(params.inertia) * change.pop("inertia", 1.0)
-        scaled = {name: getattr(params, name) * float(factor) for name, factor in change.items()}
-        params = replace(params, inertia=tuple(inertia.tolist()), **scaled)
+        force_max *= float(factors.get("kappa", 1.0))
+        params = varied_params(params, factors)
     return params.coefficients(), force_max

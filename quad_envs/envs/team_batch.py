@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._numba import entry_of
+from ..checks import array_bytes, require_memory
 from ..constraints import constraint_scales
 from ..dynamics import LANES
 from ..formations import start_positions
 from ..graphs import in_neighbours
-from ..names import nearest_name, unknown_name
+from ..names import nearest_name, shown, unknown_name
 from ..observations import N_REFERENCE
 from ..parameters import N_STATE, Array
 from ..references import make_reference, pack_rows
@@ -43,11 +44,15 @@ class TeamBatch:
         self.n = options.vehicles
         self.slots, self.graphs = np.array(self.task.slots), options.graphs
         layout = self.task.layout
-        depth = options.delay + 1
         content = PLAN + 6 * layout.plan
-        self.rows: Array = np.zeros((teams * self.n, TEAM_ROW_SIZE))
-        self._messages = np.zeros((teams * self.n, layout.neighbours, HEAD + content))
-        self._history = np.zeros((teams, depth, self.n, content))
+        shapes = (
+            (teams * self.n, TEAM_ROW_SIZE),
+            (teams * self.n, layout.neighbours, HEAD + content),
+            (teams, options.delay + 1, self.n, content),
+        )
+        self._take_choices()
+        self._require_memory(*shapes)
+        self.rows, self._messages, self._history = map(np.zeros, shapes)
         self._vector = task_vector(self.task, options.substeps, math.inf)
         self._team = _team_vector(options)
         self.neighbours = np.full((self.n, layout.neighbours), -1, dtype=np.int64)
@@ -64,12 +69,9 @@ class TeamBatch:
             for t in range(teams):
                 self.rows[[t * self.n + i for i in options.informed()], MEASURES] = 1.0
 
-    def _make_tables(self) -> None:
-        """Tables of what is drawn at reset; one that is the same in every episode is stored once."""
-        options, n, teams, never = self.options, self.n, self.teams, np.random.default_rng(0)
-        steps, dt = self.task.episode_steps, self.task.dt
-        self._times = dt * np.arange(steps + 1 + self.task.layout.preview, dtype=np.float64)
-        self._nodes = stage_times(self.task, options.substeps)
+    def _take_choices(self) -> None:
+        """What is flown, and which of it is drawn at reset."""
+        options = self.options
         self._randomization = options.randomization()
         self._noise = np.repeat(np.asarray(self.task.sensor_noise), 3)
         self._reference = make_reference(
@@ -86,22 +88,45 @@ class TeamBatch:
             self._target is not None and (self._target.random or max(self._spread) > 0.0),
             self._target is not None or options.drop_out > 0.0,
         )
+
+    def _table_shapes(self) -> list[tuple[int, ...]]:
+        """Shapes of references, disturbances, noises, targets, draws; what never changes is stored once."""
+        n, teams, steps = self.n, self.teams, self.task.episode_steps
         units = (teams, teams * n, teams * n, teams, teams)
         count = [unit if random else 1 for unit, random in zip(units, self._random, strict=True)]
-        width = 4 + self.task.layout.neighbours
-        self.references: Array = np.zeros((count[REFERENCE], self._times.size, N_TABLE))
-        n_periods = steps if self._disturbance else 0
-        self.disturbances: Array = np.zeros((count[DISTURBANCE], n_periods, self._nodes.shape[1], 6))
-        self.noises: Array = np.zeros((count[NOISE], steps + 1 if noisy else 0, N_STATE))
-        self.targets: Array = np.zeros((count[TARGET], steps + 1 if self._target else 0, N_TARGET))
-        self._draws = np.zeros((count[DRAW], steps + 1 if self._random[DRAW] else 0, n, width))
+        return [
+            (count[REFERENCE], steps + 1 + self.task.layout.preview, N_TABLE),
+            (count[DISTURBANCE], steps if self._disturbance else 0, 2 * self.options.substeps + 1, 6),
+            (count[NOISE], steps + 1 if self._random[NOISE] else 0, N_STATE),
+            (count[TARGET], steps + 1 if self._target else 0, N_TARGET),
+            (count[DRAW], steps + 1 if self._random[DRAW] else 0, n, 4 + self.task.layout.neighbours),
+        ]
+
+    def _require_memory(self, *shapes: tuple[int, ...]) -> None:
+        """Refuse what this machine cannot hold, before it is taken."""
+        seen = (self.teams * self.n, self.task.layout.size)
+        require_memory(
+            f"{shown(self.teams)} teams of {self.n} vehicles, {self.task.episode_steps} steps",
+            array_bytes(*shapes, seen, *self._table_shapes()),
+            "choose fewer of them, shorter ones, a shorter preview or delay, or fewer neighbours",
+        )
+
+    def _make_tables(self) -> None:
+        """Tables of what is drawn at reset."""
+        options, n, teams, never = self.options, self.n, self.teams, np.random.default_rng(0)
+        steps, dt = self.task.episode_steps, self.task.dt
+        self._times = dt * np.arange(steps + 1 + self.task.layout.preview, dtype=np.float64)
+        self._nodes = stage_times(self.task, options.substeps)
+        tables = [np.zeros(shape) for shape in self._table_shapes()]
+        self.references, self.disturbances, self.noises, self.targets, self._draws = tables
         self._which = np.zeros((5, teams * n), dtype=np.int64)
         for kind in range(5):
             if self._random[kind]:
                 each = 1 if kind in (DISTURBANCE, NOISE) else n
                 self._which[kind] = np.arange(teams * n) // each
+        first = reference_rows(self._reference, self._times, never)  # of a random one, to see that it works
         if not self._random[REFERENCE]:
-            self.references[0] = reference_rows(self._reference, self._times, never)
+            self.references[0] = first
         if self._disturbance is not None and not self._random[DISTURBANCE]:
             self.disturbances[0] = disturbance_rows(self._disturbance, self._nodes, dt, never)
         if self._target is not None and not self._random[TARGET]:

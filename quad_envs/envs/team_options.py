@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from functools import partial
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
-from ..agent_observations import AgentLayout
-from ..formations import FORMATIONS, make_formation, nearest_pair, start_positions
+from ..agent_observations import N_COMM, N_SENSED, AgentLayout
+from ..checks import Bound, array_bytes, require_number
+from ..formations import (
+    FARTHEST,
+    FORMATIONS,
+    MOST_VEHICLES,
+    START_GAP,
+    STARTS,
+    make_formation,
+    nearest_pair,
+    tried_starts,
+)
 from ..graphs import (
     GraphLike,
     GraphSchedule,
@@ -23,14 +33,20 @@ from ..graphs import (
 )
 from ..kinds import is_number
 from ..names import shown
+from ..observations import N_REFERENCE
 from ..parameters import Array, QuadrotorParams
 from ..references import ReferenceLike
 from ..sensors import sensor_rows
 from ..targets import TargetLike, make_target
 from ..tasks import TeamTask
-from .vehicle_options import Triple, VehicleOptions, spread
+from .given import as_numbers
+from .vehicle_options import MOST_PREVIEW, MOST_STEPS, Triple, VehicleOptions, spread
 
-MOST_VEHICLES = 200
+_MOST_SLOTS = MOST_VEHICLES - 1  # of an observation; more could hear or see nobody
+_MOST_DELAY = 10_000  # control periods
+_METRES = Bound(0.0, 1e6, "m", open=True)
+_SHARE = Bound(0.0, 1.0)
+_FACTOR = Bound(0.0, 1e9)
 FEW_VEHICLES = 6  # up to which everybody has a slot for everybody
 _SLOTS_OF_A_CROWD = 8
 CHAPTER_7_SLOTS = (
@@ -89,23 +105,25 @@ class TeamOptions(VehicleOptions):
         self.take_cycles()
         VehicleOptions.__post_init__(self)
         self.require_whole("vehicles", 2, MOST_VEHICLES)
-        self.require_whole("delay", 0)
-        self.require_whole("preview", 1 if self.comm == "plan" else 0)
+        self.require_whole("delay", 0, _MOST_DELAY, lambda n: array_bytes((n, self.vehicles, N_COMM)))
+        least = 1 if isinstance(self.comm, str) and self.comm == "plan" else 0
+        self.require_whole("preview", least, MOST_PREVIEW, partial(self._row_bytes, "preview"))
         for name in ("separation", "crash_distance", "sensing_radius", "arena"):
-            self.require_positive(name)
+            require_number(name, getattr(self, name), _METRES)
         for name, kind in (("comm", Comm), ("terminate", Terminate)):
-            if getattr(self, name) not in get_args(kind):
+            value = getattr(self, name)
+            if not isinstance(value, str) or value not in get_args(kind):
                 allowed = " or ".join(map(repr, get_args(kind)))
-                raise ValueError(f"{name} must be {allowed}, got {getattr(self, name)!r}")
-        self._require_range("drop_out", 0.0, 1.0)
+                raise ValueError(f"{name} must be {allowed}, got {shown(value)}")
+        require_number("drop_out", self.drop_out, _SHARE)
         if not (is_number(self.message_lifetime) and self.message_lifetime >= self.delay * self.dt):
             raise ValueError(
                 f"message_lifetime must be a finite number of seconds and at least the delay of {self.delay} "
                 f"steps = {self.delay * self.dt:g} s, or messages expire on their way; "
-                f"got {self.message_lifetime!r}"
+                f"got {shown(self.message_lifetime)}"
             )
-        self._require_range("leader_weight", 0.0, math.inf)
-        self._require_range("formation_weight", 0.0, math.inf)
+        for name in ("leader_weight", "formation_weight"):
+            require_number(name, getattr(self, name), _FACTOR)
         if self.crash_distance >= self.separation:
             raise ValueError(
                 f"crash_distance {self.crash_distance!r} m must be below the separation {self.separation!r} m"
@@ -118,8 +136,8 @@ class TeamOptions(VehicleOptions):
     def take_cycles(self) -> None:
         """The time limit of PettingZoo's `max_cycles`."""
         if self.max_cycles is not None:
-            self.require_whole("max_cycles", 1)
-            self.require_positive("dt")
+            self.require_whole("max_cycles", 1, MOST_STEPS)
+            self.require_times()
             object.__setattr__(self, "time_limit", self.max_cycles * self.dt)
 
     @classmethod
@@ -136,8 +154,13 @@ class TeamOptions(VehicleOptions):
         Raises:
             ValueError: If it is unknown, of the wrong size, or two vehicles start in a crash.
         """
-        slots, never = np.array(self.task.slots), np.random.default_rng(0)
-        self.require_apart(start_positions(self.start, slots, never, self.separation))
+        if isinstance(self.start, str) and self.start in STARTS and self.crash_distance > START_GAP:
+            raise ValueError(
+                f"vehicles of the start {self.start!r} may be {START_GAP:g} m apart, which is a crash "
+                f"(crash_distance = {self.crash_distance:g} m): lower it, or give an (N, 3) array"
+            )
+        for p in tried_starts(self.start, np.array(self.task.slots), self.separation):
+            self.require_apart(p)
 
     def require_apart(self, p: Array) -> None:
         """Refuse first positions p (N, 3), m, that are a crash.
@@ -152,10 +175,10 @@ class TeamOptions(VehicleOptions):
                 f"{self.crash_distance:g} m); move them apart"
             )
 
-    def _require_range(self, name: str, low: float, high: float) -> None:
-        value = getattr(self, name)
-        if not (is_number(value) and low <= value <= high):
-            raise ValueError(f"{name} must be a number from {low:g} to {high:g}, got {value!r}")
+    def _row_bytes(self, name: str, count: int) -> float:
+        """Bytes of a team's observations that so many stages, neighbours or sensed vehicles take."""
+        each = {"preview": N_REFERENCE, "neighbours": N_COMM, "sensed": N_SENSED}[name]
+        return array_bytes((self.vehicles, count, each))
 
     def make_slots(self) -> Array:
         """Wanted positions p_i*, (N, 3), m, relative to the leader's or to the target."""
@@ -187,7 +210,7 @@ class TeamOptions(VehicleOptions):
         crowd = self.vehicles > FEW_VEHICLES
         for name in ("neighbours", "sensed"):
             if getattr(self, name) is not None:
-                self.require_whole(name, 1)
+                self.require_whole(name, 1, _MOST_SLOTS, partial(self._row_bytes, name))
         K = self.neighbours or (_SLOTS_OF_A_CROWD if crowd else FEW_VEHICLES - 1)
         if in_degree > K:
             raise ValueError(
@@ -281,7 +304,7 @@ class TargetTrackingOptions(TeamOptions):
     prior_sigma: tuple[float, float] = (3.0, 1.0)
 
     def __post_init__(self) -> None:
-        self._require_range("detection", 0.0, 1.0)
+        require_number("detection", self.detection, _SHARE)
         if not isinstance(self.sensor_sigma, tuple):
             raise ValueError(
                 "sensor_sigma must be three standard deviations, of range, m, azimuth, rad, and elevation, "
@@ -292,7 +315,13 @@ class TargetTrackingOptions(TeamOptions):
         ):
             values = spread(name, getattr(self, name), length)
             if name != "prior_velocity" and min(values) < (0.0 if name == "target_spread" else 1e-9):
-                raise ValueError(f"{name} must be positive standard deviations, got {getattr(self, name)!r}")
+                raise ValueError(
+                    f"{name} must be positive standard deviations, got {shown(getattr(self, name))}"
+                )
+            if max(map(abs, values)) > FARTHEST:
+                raise ValueError(
+                    f"{name} must be at most {FARTHEST:g} (SI), got {shown(getattr(self, name))}"
+                )
             object.__setattr__(self, name, values)
         self._warn_of_narrow_prior()
         sensor_rows(self.sensor)
@@ -387,10 +416,11 @@ class EstimationOptions(TargetTrackingOptions):
 
     def rail_positions(self) -> Array:
         """Where the vehicles start, (N, 3), m."""
-        rails = np.asarray(self.rails, dtype=np.float64)
-        if rails.shape != (self.vehicles, 3) or not np.isfinite(rails).all():
+        rails = as_numbers(self.rails)
+        if rails.shape != (self.vehicles, 3) or not (np.abs(rails) <= FARTHEST).all():
             raise ValueError(
-                f"rails must be {self.vehicles} positions (x, y, z), one per vehicle, got shape {rails.shape}"
+                f"rails must be {self.vehicles} positions (x, y, z), one per vehicle, within {FARTHEST:g} m, "
+                f"got {shown(self.rails)} of shape {rails.shape}"
             )
         if nearest_pair(rails)[2] == 0.0:
             raise ValueError(f"rails of two vehicles coincide: {self.rails!r}; move one")

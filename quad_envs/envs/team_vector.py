@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from ..checks import require_whole
 from ..parameters import Array
 from ..tasks import TeamTask
 from .exchange import ALIVE, HEARD, NEAREST, SLOT_ERROR, TERMINATED, TERMS
@@ -49,8 +50,7 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
         *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     ) -> None:
-        if isinstance(num_teams, bool) or not isinstance(num_teams, int | np.integer) or num_teams < 1:
-            raise ValueError(f"num_teams must be an integer >= 1, got {num_teams!r}")
+        require_whole("num_teams", num_teams, 1)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
             raise ValueError("autoreset_mode must be NEXT_STEP or DISABLED for teams")

@@ -16,7 +16,7 @@ from ..tasks import Task
 from .batch import TrackingBatch
 from .kernel import CAUSE, PLANT, SCORES, VALUES
 from .options import TrackingOptions
-from .pictures import NO_RENDERING, TrackingPictures, checked_rendering
+from .pictures import NO_RENDERING, RenderModes, TrackingPictures, checked_rendering
 from .specified import Specified
 
 Observation = NDArray[np.float32]
@@ -88,7 +88,7 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
     G. Ru, Nonlinear Model Predictive Control for Cooperative Control and Estimation, 2017, chapters 2 to 4.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 (Gymnasium's own form)
+    metadata = {"render_modes": RenderModes(["rgb_array"]), "render_fps": 20}  # noqa: RUF012 (Gymnasium's own form)
 
     def __init__(
         self, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480), **kwargs: Any

@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from ..checks import require_whole
 from ..observations import N_REFERENCE
 from ..parameters import Array
 from ..tasks import Task
@@ -53,8 +54,7 @@ class TrackingVectorEnv(
         render_size: tuple[int, int] = (640, 480),
         **kwargs: Any,
     ) -> None:
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be >= 1, got {num_envs!r}")
+        require_whole("num_envs", num_envs, 1)
         size = checked_rendering(render_mode, ("rgb_array",), render_size)
         options = TrackingOptions.from_kwargs(kwargs)
         self.num_envs, self.render_mode = num_envs, render_mode

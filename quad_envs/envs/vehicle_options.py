@@ -4,26 +4,28 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
+from ..checks import Bound, array_bytes, require_number, require_whole
 from ..disturbances import Disturbance, DisturbanceLike, beyond_authority, disturbance_of
-from ..kinds import as_tuple, is_number
+from ..kinds import as_tuple, is_limit, is_number
 from ..names import shown, suggestion
-from ..parameters import N_INPUT, N_STATE, Limits, QuadrotorParams, Weights
+from ..parameters import N_INPUT, N_STATE, Array, Limits, QuadrotorParams, Weights
 from ..references import Reference, in_episode, length_of, make_reference, mismatch
 from ..registration import DT, TIME_LIMIT
 from ..vehicles import vehicle_values
 
-# Arguments that are one number; what it may be is checked where it is used.
-_NUMBERS = (
-    *("mass", "gravity", "arm", "yaw_moment", "rotor_rate", "drag", "rate_limit", "tilt_limit"),
-    *("velocity_limit", "dt", "time_limit"),
-)
-_MOST_STEPS = 1_000_000  # control periods of an episode; its tables are made at reset
+MOST_STEPS = 1_000_000  # control periods of an episode; its tables are made at reset
+_MOST_SUBSTEPS = 1000
+MOST_PREVIEW = 10_000  # stages
+_PERIOD = Bound(1e-5, 1.0, "s", "slower, no controller holds a quadrotor; faster, times are rounding")
+POSITIVE = Bound(0.0, 1e9, open=True)
+NOISE = Bound(0.0, 1e3, "m, m/s, rad or rad/s", "beyond, a measurement says nothing of the vehicle")
+_RK4_REAL = 2.5  # |h lambda| up to which RK4 follows a decay; its limit is 2.785
 RANDOMIZABLE = ("mass", "inertia", "arm", "kappa", "rotor_rate", "drag")
 CRASH_TILT = math.radians(85.0)  # rad; the Euler rates are singular at 90 degrees
 Triple = tuple[float, float, float]
@@ -63,27 +65,23 @@ class VehicleOptions:
     reward: str = "bounded"
 
     def __post_init__(self) -> None:
-        for name in _NUMBERS:
-            if not isinstance(getattr(self, name), int | float | np.integer | np.floating):
-                raise ValueError(f"{name} must be a number, got {shown(getattr(self, name))}")
         vehicle_values(self.vehicle)
-        for name in ("dt", "time_limit"):
-            self.require_positive(name)
+        self.require_times()
         steps = self.time_limit / self.dt
-        if not 1.0 <= steps <= _MOST_STEPS or abs(steps - round(steps)) > 1e-6 * steps:
+        if not 1.0 <= steps <= MOST_STEPS or abs(steps - round(steps)) > 1e-6 * steps:
             raise ValueError(
-                f"time_limit must be 1 to {_MOST_STEPS} whole control periods of dt = {self.dt} s, "
-                f"got {self.time_limit!r} s"
+                f"time_limit must be 1 to {MOST_STEPS} whole control periods of dt = {self.dt} s, "
+                f"got {shown(self.time_limit)} s"
             )
         if not isinstance(self.reveal_disturbance, bool | np.bool_):
-            raise ValueError(f"reveal_disturbance must be True or False, got {self.reveal_disturbance!r}")
+            raise ValueError(
+                f"reveal_disturbance must be True or False, got {shown(self.reveal_disturbance)}"
+            )
         rotors = self.kappa if isinstance(self.kappa, tuple) else (self.kappa,) * N_INPUT
         if len(rotors) != N_INPUT or not all(map(is_number, rotors)):
             raise ValueError(
-                f"kappa must be a number or {N_INPUT} of them, one per rotor, got {self.kappa!r}"
+                f"kappa must be a number or {N_INPUT} of them, one per rotor, got {shown(self.kappa)}"
             )
-        if not _is_vector(self.inertia):
-            raise ValueError(f"inertia must be three numbers (Jx, Jy, Jz), got {self.inertia!r}")
         if self.position_limit is not None and not (
             isinstance(self.position_limit, tuple)
             and len(self.position_limit) == 2
@@ -91,14 +89,15 @@ class VehicleOptions:
         ):
             raise ValueError(
                 "position_limit must be None or ((x, y, z) lower, (x, y, z) upper), "
-                f"got {self.position_limit!r}"
+                f"got {shown(self.position_limit)}"
             )
-        self.require_whole("substeps", 1)
+        steps = self.episode_steps
+        self.require_whole("substeps", 1, _MOST_SUBSTEPS, lambda n: array_bytes((steps, 2 * n + 1, 7)))
         if self.reward not in ("bounded", "quadratic"):
-            raise ValueError(f"reward must be 'bounded' or 'quadratic', got {self.reward!r}")
+            raise ValueError(f"reward must be 'bounded' or 'quadratic', got {shown(self.reward)}")
         # Build what can be built, so that a bad value is refused here and not at the first reset.
         self.make_limits()
-        self.randomization()
+        self._require_followed_drag(self.randomization())
         self.noise_deviations()
         excess = beyond_authority(self.make_disturbance(), self.make_params(), self.make_limits())
         if excess:
@@ -112,11 +111,19 @@ class VehicleOptions:
         """
         made = make_reference(what)
         if isinstance(self.time_limit, str) and self.time_limit == "reference":
-            self.require_positive("dt")
+            require_number("dt", self.dt, _PERIOD)
             object.__setattr__(self, "time_limit", length_of(made, self.dt))
-        for name in ("dt", "time_limit"):
-            self.require_positive(name)
+        self.require_times()
         return made
+
+    def require_times(self) -> None:
+        """Check the control period and the time limit.
+
+        Raises:
+            ValueError: If one is not allowed.
+        """
+        require_number("dt", self.dt, _PERIOD)
+        self.require_positive("time_limit")
 
     def within_episode(self, trajectory: Any) -> Any:
         """A reference or target as it is in these episodes; a warning says if it does not fit them."""
@@ -132,20 +139,28 @@ class VehicleOptions:
         Raises:
             ValueError: If it is not.
         """
-        value = getattr(self, name)
-        if not (is_number(value) and value > 0.0):
-            raise ValueError(f"{name} must be a finite number > 0, got {value!r}")
+        require_number(name, getattr(self, name), POSITIVE)
 
-    def require_whole(self, name: str, least: int, most: float = math.inf) -> None:
-        """Check that a field is a whole number in a range.
+    def require_whole(
+        self, name: str, least: int, most: int, memory: Callable[[int], float] | None = None
+    ) -> None:
+        """Check that a field is a whole number in a range, see `checks.require_whole`.
 
         Raises:
             ValueError: If it is not.
         """
-        value = getattr(self, name)
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
-            allowed = f">= {least}" if most == math.inf else f"from {least} to {most}"
-            raise ValueError(f"{name} must be an integer {allowed}, got {value!r}")
+        require_whole(name, getattr(self, name), least, most, memory)
+
+    def _require_followed_drag(self, ranges: Mapping[str, float]) -> None:
+        """Refuse a drag that brakes the lightest vehicle faster than the integrator can follow."""
+        h = self.dt / self.substeps
+        most = _RK4_REAL / h * self.mass * (1.0 - ranges.get("mass", 0.0)) / (1.0 + ranges.get("drag", 0.0))
+        if self.drag > most:
+            raise ValueError(
+                f"drag must be at most {most:.3g} kg/s, got {shown(self.drag)}: it brakes {self.mass:g} kg "
+                f"within {self.mass / self.drag:.1e} s, which steps of {h:g} s cannot follow; lower it, or "
+                "raise substeps"
+            )
 
     @classmethod
     def from_kwargs(cls: type[Options], kwargs: Mapping[str, Any]) -> Options:
@@ -221,8 +236,8 @@ class VehicleOptions:
     def noise_deviations(self) -> tuple[float, float, float, float]:
         """Standard deviations of measured position, velocity, attitude and rates; one number is for all."""
         values = spread("sensor_noise", self.sensor_noise, 4)
-        if not all(value >= 0.0 for value in values):
-            raise ValueError(f"sensor_noise must be >= 0, got {self.sensor_noise!r}")
+        for value in values:
+            require_number("sensor_noise", value, NOISE)
         return values[0], values[1], values[2], values[3]
 
     def randomization(self) -> dict[str, float]:
@@ -233,9 +248,9 @@ class VehicleOptions:
             ranges = {name: self.randomize for name in RANDOMIZABLE if name != "drag" or self.drag > 0.0}
         for name, value in ranges.items():
             if name not in RANDOMIZABLE:
-                raise ValueError(f"randomize knows {', '.join(RANDOMIZABLE)}; got {name!r}")
+                raise ValueError(f"randomize knows {', '.join(RANDOMIZABLE)}; got {shown(name)}")
             if not (is_number(value) and 0.0 <= value < 1.0):
-                raise ValueError(f"randomize[{name!r}] is a relative spread in [0, 1), got {value!r}")
+                raise ValueError(f"randomize[{name!r}] is a relative spread in [0, 1), got {shown(value)}")
             if name == "drag" and value > 0.0 and self.drag == 0.0:
                 raise ValueError(
                     "randomize['drag'] varies the drag in proportion: give the env a drag > 0 first"
@@ -243,18 +258,42 @@ class VehicleOptions:
         weakest = min(self.make_limits().kappas) * (1.0 - ranges.get("kappa", 0.0))
         if weakest <= 0.25 * (1.0 + ranges.get("mass", 0.0)):
             raise ValueError(
-                f"randomize={self.randomize!r} would draw rotors too weak to hover at kappa = {self.kappa}"
+                f"randomize={shown(self.randomize)} would draw rotors too weak to hover at kappa = "
+                f"{self.kappa}"
             )
-        return {name: float(value) for name, value in ranges.items() if value > 0.0}
+        ranges = {name: float(value) for name, value in ranges.items() if value > 0.0}
+        for sign in (-1.0, 1.0):  # what is drawn is made then; here it is refused if it could not be
+            varied_params(self.make_params(), {name: 1.0 + sign * value for name, value in ranges.items()})
+        return ranges
+
+
+def varied_params(params: QuadrotorParams, factors: Mapping[str, float | Array]) -> QuadrotorParams:
+    """A vehicle whose parameters are multiplied; kappa is none of them.
+
+    Where the largest principal moment would exceed the sum of the others, as that of no body does, it is
+    that sum.
+
+    Args:
+        params: The nominal vehicle.
+        factors: Parameter -> factor; of the inertia one, or three.
+
+    Raises:
+        ValueError: If a parameter would be beyond every vehicle.
+    """
+    values: dict[str, Any] = {
+        name: getattr(params, name) * float(factor)
+        for name, factor in factors.items()
+        if name not in ("kappa", "inertia")
+    }
+    J = np.asarray(params.inertia) * factors.get("inertia", 1.0)
+    largest = int(np.argmax(J))
+    J[largest] = min(J[largest], J.sum() - J[largest])
+    return replace(params, inertia=tuple(J.tolist()), **values)
 
 
 def _is_vector(value: object) -> bool:
     """Whether it is three numbers, possibly infinite."""
-    return (
-        isinstance(value, tuple)
-        and len(value) == 3
-        and all(isinstance(entry, int | float | np.integer | np.floating) for entry in value)
-    )
+    return isinstance(value, tuple) and len(value) == 3 and all(map(is_limit, value))
 
 
 def spread(name: str, value: float | tuple[float, ...], length: int) -> tuple[float, ...]:
@@ -265,5 +304,5 @@ def spread(name: str, value: float | tuple[float, ...], length: int) -> tuple[fl
     """
     values = value if isinstance(value, tuple) else (value,) * length
     if len(values) != length or not all(map(is_number, values)):
-        raise ValueError(f"{name} must be one finite number or {length} of them, got {value!r}")
+        raise ValueError(f"{name} must be one finite number or {length} of them, got {shown(value)}")
     return tuple(float(entry) for entry in values)

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..kinds import make_kind, refuse_class
+from ..kinds import make_kind, refuse_class, without_booleans
 from ..names import shown, unknown_name
 from .arrays import ArrayTable, from_numbers
 from .functions import FunctionReference
@@ -92,7 +92,8 @@ def make_reference(what: Any) -> Reference:
     """
     refuse_class("reference", what)
     if isinstance(what, Reference):
-        return what
+        checked: Reference = without_booleans("reference", what, REFERENCES)
+        return checked
     if isinstance(what, str) and what in REFERENCES:
         return make_reference({"kind": what})
     if is_table(what):

@@ -6,16 +6,21 @@ reproduce tables 4.1 and 4.2; the dissertation shows its trajectories only as fi
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..checks import require_whole
+from ..names import shown
 from ..observations import N_REFERENCE
 from ..parameters import Array
+from .plausible import FASTEST
 
 _RESTING_SPEED = 0.05  # m/s
+_MOST_HARMONICS = 1000
 
 
 @runtime_checkable
@@ -170,7 +175,8 @@ class RandomSmooth:
     """A sum of sines per axis with random amplitudes, rates and phases, shifted to start at the origin.
 
     Raises:
-        ValueError: If the rates are not 0 < rate_min <= rate_max or there is no harmonic.
+        ValueError: If the rates are not 0 < rate_min <= rate_max, there is no harmonic, or one that is drawn
+            may be faster than any vehicle.
     """
 
     amplitude: tuple[float, float, float] = (3.0, 3.0, 1.5)  # m, bound on the sum of the sines per axis
@@ -182,10 +188,16 @@ class RandomSmooth:
     def __post_init__(self) -> None:
         if not 0.0 < self.rate_min <= self.rate_max:
             raise ValueError(
-                f"need 0 < rate_min <= rate_max, got {self.rate_min!r} and {self.rate_max!r} rad/s"
+                f"need 0 < rate_min <= rate_max, got {shown(self.rate_min)} and {shown(self.rate_max)} rad/s"
             )
-        if self.harmonics < 1:
-            raise ValueError(f"harmonics must be >= 1, got {self.harmonics!r}")
+        require_whole("harmonics", self.harmonics, 1, _MOST_HARMONICS)
+        fastest = self.rate_max * math.hypot(*self.amplitude)
+        if not fastest <= FASTEST:
+            raise ValueError(
+                f"a random reference of amplitude {shown(self.amplitude)} m and rates up to "
+                f"{self.rate_max:g} rad/s may move at {fastest:.4g} m/s, and no quadrotor flies faster than "
+                f"{FASTEST:g} m/s: lower one of them"
+            )
 
     def rows(self, t: Array, rng: np.random.Generator) -> Array:
         """Reference rows of a new random trajectory, (n, 8)."""

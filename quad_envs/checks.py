@@ -1,0 +1,111 @@
+"""Checks of arguments that everything shares: numbers within bounds that have a reason, sizes that fit."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .kinds import is_number
+from .names import shown
+
+_GIB = 2.0**30
+_SHARE = 0.75  # of the machine's memory, that one thing may plan with
+_MEMORY = 16 * _GIB  # of a machine that does not say
+
+
+class Bound(NamedTuple):
+    """What a number may be, and why."""
+
+    least: float
+    most: float
+    unit: str = ""
+    why: str = ""  # a clause, for the message
+    open: bool = False  # whether `least` itself is not allowed
+
+    def __str__(self) -> str:
+        low = f"a finite number > {self.least:g} and" if self.open else f"a number from {self.least:g}"
+        return f"{low} {'<=' if self.open else 'to'} {self.most:g} {self.unit}".rstrip()
+
+
+def require_number(what: str, value: Any, bound: Bound) -> None:
+    """Check that a value is a number within a bound; True and False are none.
+
+    Raises:
+        ValueError: If it is not; the message has the bound and its reason.
+    """
+    if is_number(value) and bound.least <= value <= bound.most and not (bound.open and value == bound.least):
+        return
+    reason = f"; {bound.why}" if bound.why and is_number(value) else ""
+    raise ValueError(f"{what} must be {bound}, got {shown(value)}{reason}")
+
+
+def require_whole(
+    what: str,
+    value: Any,
+    least: int,
+    most: int | None = None,
+    memory: Callable[[int], float] | None = None,
+) -> None:
+    """Check that a value is a whole number within bounds.
+
+    Args:
+        what: What it is, for the message.
+        value: It.
+        least: The smallest that is allowed.
+        most: The largest that is allowed; None for any.
+        memory: Bytes that a value takes, for the message about one that is too large.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if whole and value >= least and (most is None or value <= most):
+        return
+    allowed, taken = f">= {least}", ""
+    if whole and most is not None and value > most:
+        allowed = f"from {least} to {most}"
+        taken = f", which would take about {memory_text(memory(int(value)))}" if memory else ""
+    raise ValueError(f"{what} must be a whole number {allowed}, got {shown(value)}{taken}")
+
+
+def require_memory(what: str, size: float, remedy: str) -> None:
+    """Check that this machine has the memory for something, before it is taken.
+
+    Args:
+        what: Takes it, for the message.
+        size: Bytes, at least.
+        remedy: What to do if they are too many.
+
+    Raises:
+        ValueError: If they are.
+    """
+    has = _machine_memory()
+    if size > _SHARE * has:
+        raise ValueError(
+            f"{what} would take {memory_text(size)}, more than {_SHARE:.0%} of this machine's "
+            f"{has / _GIB:.3g} GiB: {remedy}"
+        )
+
+
+def memory_text(size: float) -> str:
+    """Bytes as GiB, whatever their number."""
+    try:
+        return f"{float(size) / _GIB:.3g} GiB of memory"
+    except OverflowError:  # an integer beyond all floats
+        return "more memory than any machine has"
+
+
+def array_bytes(*shapes: tuple[int, ...]) -> int:
+    """Bytes of float64 arrays of these shapes."""
+    return 8 * sum(math.prod(map(int, shape)) for shape in shapes)
+
+
+def _machine_memory() -> float:
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE")) * float(os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, OSError, ValueError):  # no POSIX system
+        return _MEMORY
