@@ -9,7 +9,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from .checks import require_whole
+from .checks import require_jobs
 from .comparison import Results
 from .engines import check_engine
 from .environments import make_env
@@ -87,7 +87,7 @@ def fly_suite(
 ) -> Results:
     """`run_benchmark` where some policies, by their titles, are objects."""
     check_engine(order.engine)
-    require_whole("jobs", order.jobs, 1)
+    require_jobs(order.jobs)
     _refuse_no_folder(suite, out, order)
     failed = _refuse_bad_units(suite, given)
     folder = None if out is None else Path(out).absolute()

@@ -1,22 +1,32 @@
-"""Checks of arguments that several functions share."""
+"""Checks of how much is flown, and by how many at once."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
+from quad_envs.checks import require_memory, require_whole
+
+MOST_EPISODES = 100_000
+_EPISODE_BYTES = 4000  # a record, and two float32 decision times of 200 steps
+_MOST_JOBS = 1024
+_JOB_BYTES = 200_000_000  # an interpreter with its compiled kernels
 
 
-def require_whole(what: str, value: Any, least: int) -> None:
-    """Check that a value is a whole number that is large enough.
-
-    Args:
-        what: What it is, for the message.
-        value: It.
-        least: The smallest that is allowed.
+def require_episodes(what: str, value: Any) -> None:
+    """Check a number of flights.
 
     Raises:
-        ValueError: If it is not.
+        ValueError: If it is not a whole number from 1 to MOST_EPISODES.
     """
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise ValueError(f"{what} must be a whole number >= {least}, got {value!r}")
+    require_whole(what, value, 1, MOST_EPISODES, lambda n: n * _EPISODE_BYTES)
+
+
+def require_jobs(value: Any) -> None:
+    """Check a number of processes.
+
+    Raises:
+        ValueError: If it is not a whole number >= 1, or this machine has not the memory for them.
+    """
+    require_whole("jobs", value, 1, _MOST_JOBS, lambda n: n * _JOB_BYTES)
+    if value > 1:
+        require_memory(f"{value} processes", value * _JOB_BYTES, "choose fewer jobs")

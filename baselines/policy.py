@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast, runtime_check
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_envs.names import unknown_name
+from quad_envs.kinds import holds_booleans, is_limit
+from quad_envs.names import shown, unknown_name
 
 from .outside import build, installed_policies, is_outside, names_factory, outside_options
 from .trained import load_policy, names_trained, shipped_policies
@@ -231,24 +232,31 @@ def policy_options(name: str) -> dict[str, Any]:
     """
     if from_outside(name):
         return outside_options(name)
-    factory = _factory(policy_entry(name))
-    parameters = list(inspect.signature(factory).parameters.values())[1:]  # the first is the task
-    return {parameter.name: parameter.default for parameter in parameters}
+    return {parameter.name: parameter.default for parameter in _parameters(name)}
 
 
-def _check_kind(name: str, option: str, value: Any, default: Any) -> None:
+def _parameters(name: str) -> list[inspect.Parameter]:
+    """Of a policy's factory, behind the task."""
+    return list(inspect.signature(_factory(policy_entry(name))).parameters.values())[1:]
+
+
+def _check_kind(name: str, parameter: inspect.Parameter, value: Any) -> None:
     """Refuse a word for a number and the like; whether the number is allowed, the controller knows."""
-    if isinstance(default, bool):
+    option, default, hint = parameter.name, parameter.default, str(parameter.annotation)
+    if "ArrayLike" in hint:
+        kind, fits = "numbers", not isinstance(value, str) and not holds_booleans(value)
+    elif isinstance(default, bool):
         kind, fits = "True or False", isinstance(value, bool | np.bool_)
     elif isinstance(default, int | float):
-        fits = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-        kind = "a number"
+        kind, fits = "a number", is_limit(value)
     elif isinstance(default, str) and default != "auto":  # "auto" stands for a number, too
         kind, fits = "a name", isinstance(value, str)
     else:
-        return
+        kind, fits = "no boolean", "Any" in hint or "bool" in hint or not isinstance(value, bool | np.bool_)
     if not fits:
-        raise ValueError(f"{option} of policy {name!r} must be {kind}, got {value!r} (default {default!r})")
+        raise ValueError(
+            f"{option} of policy {name!r} must be {kind}, got {shown(value)} (default {default!r})"
+        )
 
 
 def make_policy(name: str | os.PathLike[str] | Any, env: Any, **options: Any) -> Policy:
@@ -280,11 +288,12 @@ def make_policy(name: str | os.PathLike[str] | Any, env: Any, **options: Any) ->
             raise ValueError(f"a trained policy has no options, got {', '.join(options)}")
         return load_policy(name, env)
     name = str(name)
+    known = {parameter.name: parameter for parameter in _parameters(name)}
+    for option, value in options.items():
+        if option not in known:
+            raise ValueError(unknown_name(f"option of policy {name!r}:", option, known))
+        _check_kind(name, known[option], value)
     defaults = policy_options(name)
-    for option in options:
-        if option not in defaults:
-            raise ValueError(unknown_name(f"option of policy {name!r}:", option, defaults))
-        _check_kind(name, option, options[option], defaults[option])
     task: BaseTask = task_of(env)
     factory = _factory(policy_entry(name, mission_of(task)))
     if mission_of(task) in TEAM_MISSIONS:

@@ -14,11 +14,12 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
+from quad_envs.checks import require_whole
 from quad_envs.observations import N_REFERENCE
 from quad_envs.parameters import Array
 from quad_envs.tasks import BaseTask, TeamTask
 
-from .checks import require_whole
+from .checks import require_episodes
 from .deciding import decide
 from .environments import is_parallel, require_own_task
 from .episode import INFO, Episode, Recorder, Said
@@ -58,7 +59,7 @@ def run_episodes(
             resets in the same step, or a privileged policy cannot see the truth. In flight if an observation
             or an action is not finite, with the row, its seed and the step.
     """
-    require_whole("episodes", episodes, 1)
+    require_episodes("episodes", episodes)
     require_whole("seed", seed, 0)
     require_own_task(env)
     require_pair(policy, env, mismatch)

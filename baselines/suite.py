@@ -9,9 +9,10 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+from quad_envs.checks import require_whole
 from quad_envs.names import unknown_name
 
-from .checks import require_whole
+from .checks import require_episodes
 
 # What --quick keeps of a suite.
 _QUICK_SEEDS, _QUICK_CONDITIONS, _QUICK_EPISODES = 2, 2, 5
@@ -127,8 +128,8 @@ class Suite:
         for name in ("name", "compare_with"):
             if not isinstance(getattr(self, name), str):
                 raise ValueError(f"{name} of a suite must be text, got {getattr(self, name)!r}")
-        for name, least in (("episodes", 1), ("seed", 0)):
-            require_whole(f"{name} of suite {self.name!r}", getattr(self, name), least)
+        require_episodes(f"episodes of suite {self.name!r}", self.episodes)
+        require_whole(f"seed of suite {self.name!r}", self.seed, 0)
         for kind in ("envs", "policies", "conditions"):
             titles = [choice.title for choice in getattr(self, kind)]
             if not titles and kind != "conditions":

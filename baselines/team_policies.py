@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_envs.checks import require_whole
 from quad_envs.tasks import TeamTask
 
-from .checks import require_whole
 from .policy import N_FALLBACKS, Actions, PolicyState
 from .rows import as_rows, as_starts, not_finite, state_of
 

@@ -10,12 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from controllers.controller import TURNING_ROWS, Controller, Decision
 from quad_envs._numba import kernel
+from quad_envs.checks import require_whole
 from quad_envs.constraints import action_from_force, forces_from_actions
 from quad_envs.observations import N_OWN, N_REFERENCE, decode_own
 from quad_envs.parameters import Array
 from quad_envs.tasks import Task
 
-from .checks import require_whole
 from .policy import N_FALLBACKS, Actions, Counts, PolicyState
 from .rows import as_rows, as_starts, first_not_finite, not_finite, state_of, times_left
 

@@ -23,18 +23,20 @@ import osqp
 import scipy.sparse as sparse
 from numpy.typing import ArrayLike, NDArray
 
+from quad_envs.checks import array_bytes, require_memory, require_whole
 from quad_envs.observations import N_REFERENCE
 from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, VELOCITY, Array
 from quad_envs.rotations import rotation_body_from_inertial, wrap_angle
 from quad_envs.tasks import TeamTask
 from quad_envs.turning import TURN_RATE, turning_rates, with_turn_rates
 
-from .controller import PLANT_SIZE, Decision, as_array
+from .controller import PLANT_SIZE, Decision, as_array, require_horizon
 from .fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, limit_command
 from .model import sdc_pair
 from .mpc import MpcOptions, mpc_data
 from .mpc_kernels import add_rotor_lag, left_model
 from .ocp import Condensed, OcpQp, condense, no_rows
+from .solvers.solution import MOST_ITERATIONS
 from .solvers.structured import ITERATION_LIMIT
 
 _SOLVED = 1
@@ -109,8 +111,7 @@ class CentralMpc:
                 f"a central MPC takes at most {_MOST_VEHICLES} vehicles, got {task.vehicles}: it fills dense "
                 "matrices, whose size grows with the fourth power of that number; use a distributed MPC"
             )
-        if horizon != int(horizon) or horizon < 1:
-            raise ValueError(f"horizon must be a whole number of samples >= 1, got {horizon!r}")
+        horizon = require_horizon(horizon)
         if not 0.0 <= alpha <= 1.0:
             raise ValueError(f"alpha must lie in [0, 1], got {alpha!r}")
         if not (0.0 <= braking_time < math.inf and abs(swirl) < math.pi / 2 and separation_weight > 0.0):
@@ -118,14 +119,18 @@ class CentralMpc:
                 "braking_time must be >= 0 s, |swirl| < pi/2 rad and separation_weight > 0, "
                 f"got {braking_time!r}, {swirl!r}, {separation_weight!r}"
             )
-        if not (
-            eps > 0.0 and max_iter >= 1 and math.isfinite(soft_weight) and math.isfinite(separation_weight)
-        ):
+        require_whole("max_iter", max_iter, 1, MOST_ITERATIONS)
+        if not (eps > 0.0 and math.isfinite(soft_weight) and math.isfinite(separation_weight)):
             raise ValueError(
-                "eps must be > 0, max_iter >= 1 and the weights finite, "
-                f"got {eps!r}, {max_iter!r}, {soft_weight!r}, {separation_weight!r}"
+                f"eps must be > 0 and the weights finite, got {eps!r}, {soft_weight!r}, {separation_weight!r}"
             )
-        self.task, self.horizon, self.alpha = task, int(horizon), float(alpha)
+        inputs = N_INPUT * task.vehicles * horizon
+        require_memory(
+            f"a central MPC of {task.vehicles} vehicles and horizon {horizon}",
+            array_bytes((inputs, inputs)),
+            "choose a shorter horizon",
+        )
+        self.task, self.horizon, self.alpha = task, horizon, float(alpha)
         self.braking_time, self.swirl = float(braking_time), float(swirl)
         options = MpcOptions(
             "osqp", "heading", "attitude", soft_weight, margin, False, "auto", ITERATION_LIMIT

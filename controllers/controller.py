@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quad_envs._numba import kernel
+from quad_envs.checks import array_bytes, require_whole
 from quad_envs.observations import N_REFERENCE
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 
@@ -17,6 +18,8 @@ from .disturbance import N_DISTURBANCE
 from .ocp import IntArray
 
 PLANT_SIZE = N_STATE + N_INPUT
+MOST_HORIZON = 1000  # samples; a solver fills matrices with the square of it
+MOST_PASSES = 100  # through a problem in one decision
 TURNING_ROWS = 3  # rows of a window from which a law without preview reads how the heading turns
 _NAMES = ("plant", "window", "last_command", "disturbance", "memory")
 
@@ -29,6 +32,16 @@ class Decision(NamedTuple):
     fallback: IntArray  # (n,), Fallback: how each command was found
     iterations: IntArray  # (n,), active-set iterations
     left_model: IntArray | None = None  # (n,), 1 where its state or plan left where the model holds; None: 0
+
+
+def require_horizon(horizon: Any) -> int:
+    """The horizon N, samples.
+
+    Raises:
+        ValueError: If it is not a whole number that a solver's memory allows.
+    """
+    require_whole("horizon", horizon, 1, MOST_HORIZON, lambda N: array_bytes((2, N_INPUT * N, N_INPUT * N)))
+    return int(horizon)
 
 
 class Controller(Protocol):

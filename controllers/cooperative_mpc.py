@@ -25,7 +25,7 @@ from quad_envs.tasks import TeamTask
 from .collision import COLLISION_SCRATCH, AvoidanceOptions, AvoidanceRule, AvoidanceSet, time_to_stop
 from .consensus import ConsensusOptions, Neighbour, TargetModel, require_messages
 from .consensus_kernels import CONSENSUS_SCRATCH
-from .controller import PLANT_SIZE, as_array
+from .controller import PLANT_SIZE, as_array, require_horizon
 from .cooperative_kernels import NAMES, RowLayout, Team, decide_team, pose_row
 from .disturbance import ESTIMATOR_SIZE, N_DISTURBANCE
 from .mpc import MpcOptions, mpc_data, require_choice
@@ -125,14 +125,13 @@ class CooperativeMpc:
         estimator_gain: float | Literal["auto"] = "auto",
         iteration_limit: int = ITERATION_LIMIT,
     ) -> None:
-        if horizon != int(horizon) or horizon < 1:
-            raise ValueError(f"horizon must be a whole number of samples >= 1, got {horizon!r}")
+        horizon = require_horizon(horizon)
         if not 0.0 <= alpha <= 1.0:
             raise ValueError(f"alpha must lie in [0, 1], got {alpha!r}; 1/2 is the dissertation's")
         require_choice("terminal_weight", terminal_weight, CooperativeTerminalWeight)
         if not plan_tilt > 0.0:
             raise ValueError(f"plan_tilt must be > 0 rad, got {plan_tilt!r}; math.inf is no limit")
-        self.task, self.horizon = task, int(horizon)
+        self.task, self.horizon = task, horizon
         self.consensus = ConsensusOptions(
             neighbour, feed_forward, attitude, reach, speed, formation_weight, target
         )

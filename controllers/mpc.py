@@ -10,10 +10,11 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quad_envs.checks import require_whole
 from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, VELOCITY, Array, Limits
 from quad_envs.tasks import BaseTask, Task
 
-from .controller import Decision, as_one_row, as_rows, first_non_finite, raise_non_finite
+from .controller import Decision, as_one_row, as_rows, first_non_finite, raise_non_finite, require_horizon
 from .disturbance import ESTIMATOR_SIZE, N_DISTURBANCE
 from .estimator_gain import estimator_gains
 from .fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXED_WEIGHT
@@ -33,6 +34,7 @@ from .mpc_kernels import (
 from .ocp import IntArray, OcpQp, StateRows, concatenate_rows, no_rows, output_rows
 from .riccati import dare
 from .solvers import Backend, Status, StructuredSolver
+from .solvers.solution import MOST_ITERATIONS
 from .solvers.structured import Workspace, make_workspace
 from .weights import require_turnable, terminal_weight, weight_matrix
 
@@ -90,11 +92,9 @@ class MpcOptions:
             raise ValueError(f"estimator_gain must be 'auto' or lie in (0, 1], got {self.estimator_gain!r}")
         if not self.plan_tilt > 0.0:
             raise ValueError(f"plan_tilt must be > 0 rad, got {self.plan_tilt!r}; math.inf is no limit")
-        if self.iteration_limit < 0:
-            raise ValueError(
-                "iteration_limit must be at least 1, or 0 for one that grows with the problem, "
-                f"got {self.iteration_limit!r}"
-            )
+        require_whole(
+            "iteration_limit (0: one that grows with the problem)", self.iteration_limit, 0, MOST_ITERATIONS
+        )
 
 
 class Problem(NamedTuple):
@@ -203,10 +203,9 @@ class Mpc(ABC):
     """
 
     def __init__(self, task: Task, horizon: int, options: MpcOptions, *, pairs: int, guess: bool) -> None:
-        if horizon != int(horizon) or horizon < 1:
-            raise ValueError(f"horizon must be a whole number of samples >= 1, got {horizon!r}")
+        horizon = require_horizon(horizon)
         self.task = task
-        self.horizon = int(horizon)
+        self.horizon = horizon
         self.options = options
         self._data = mpc_data(task, self.horizon, options)
         self._pairs = pairs

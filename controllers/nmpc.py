@@ -12,11 +12,12 @@ from typing import Any, Literal
 from numpy.typing import ArrayLike
 
 from quad_envs._numba import kernel
+from quad_envs.checks import require_whole
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 from quad_envs.rotations import sincos, wrap_angle_scalar
 from quad_envs.tasks import Task
 
-from .controller import first_non_finite
+from .controller import MOST_PASSES, first_non_finite
 from .fallback import RELAXED
 from .linalg import copy, fill
 from .model import RK4_SCRATCH, rk4_sensitivities, rotated_derivatives
@@ -319,8 +320,7 @@ class ExactNmpc(Mpc):
         plan_tilt: float | None = None,
         terminal: ArrayLike = 1.0,
     ) -> None:
-        if passes != int(passes) or passes < 1:
-            raise ValueError(f"passes must be a whole number >= 1, got {passes!r}")
+        require_whole("passes", passes, 1, MOST_PASSES)
         require_choice("velocity_error", velocity_error, VelocityError)
         options = MpcOptions(
             solver, frame, "heading", soft_weight, margin, reject_disturbance, estimator_gain,

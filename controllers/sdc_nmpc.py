@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quad_envs._numba import kernel
+from quad_envs.checks import require_whole
 from quad_envs.parameters import N_STATE, Array
 from quad_envs.tasks import Task
 
-from .controller import first_non_finite
+from .controller import MOST_PASSES, first_non_finite
 from .fallback import RELAXED
 from .linalg import copy
 from .model import sdc_matrix, zero_order_hold
@@ -234,14 +235,11 @@ class SdcNmpc(Mpc):
             raise ValueError(
                 f"alpha must lie in [0, 1], got {alpha!r}; 1/2 is the dissertation's, 1 recommended"
             )
-        if relinearisations == "auto":
+        if isinstance(relinearisations, str) and relinearisations == "auto":
             passes = 1 if frame == "heading" else 0
-        elif isinstance(relinearisations, int | np.integer) and relinearisations >= 0:
-            passes = int(relinearisations)
         else:
-            raise ValueError(
-                f"relinearisations must be 'auto' or a whole number >= 0, got {relinearisations!r}"
-            )
+            require_whole("relinearisations, if not 'auto',", relinearisations, 0, MOST_PASSES)
+            passes = int(relinearisations)
         require_choice("terminal_weight", terminal_weight, TerminalWeight)
         options = MpcOptions(
             solver,

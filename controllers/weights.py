@@ -7,7 +7,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quad_envs.parameters import Array
+from quad_envs.kinds import holds_booleans, is_number
+from quad_envs.names import shown
+from quad_envs.parameters import MOST_WEIGHT, Array
 from quad_envs.rotations import sincos
 
 _SYMMETRY = 1e-9  # relative, what two ways of summing the same matrix may differ by
@@ -31,12 +33,13 @@ def weight_matrix(name: str, value: ArrayLike, size: int, *, definite: bool) -> 
     """
     try:
         given = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         given = np.full(1, math.nan)
-    if given.shape not in ((), (size,), (size, size)) or not np.isfinite(given).all():
+    fits = given.shape in ((), (size,), (size, size)) and not holds_booleans(value)
+    if not (fits and (np.abs(given) <= MOST_WEIGHT).all()):
         raise ValueError(
             f"{name} must be a finite number, {size} of them (the diagonal) or a ({size}, {size}) matrix, "
-            f"got shape {given.shape}" + ("" if given.size > size else f": {np.array2string(given)}")
+            f"at most {MOST_WEIGHT:g}, got shape {given.shape}: {shown(value)}"
         )
     matrix = given.copy() if given.ndim == 2 else np.diag(np.broadcast_to(given, (size,)))
     scale = float(np.abs(matrix).max())
@@ -61,8 +64,8 @@ def terminal_weight(value: ArrayLike, P: Array) -> Array:
         ValueError: If it is neither.
     """
     if np.ndim(value) == 0:
-        if not (isinstance(value, int | float | np.number) and 0.0 <= float(value) < math.inf):
-            raise ValueError(f"terminal must be a finite factor >= 0 of P or a matrix, got {value!r}")
+        if not (is_number(value) and value >= 0.0):
+            raise ValueError(f"terminal must be a finite factor >= 0 of P or a matrix, got {shown(value)}")
         return P * float(value)
     if np.ndim(value) != 2:
         raise ValueError(f"terminal must be a factor of P or a {P.shape} matrix, got shape {np.shape(value)}")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, fields, is_dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeGuard
 
 import numpy as np
 
@@ -156,7 +156,7 @@ def _require_alike(what: str, value: Any, default: Any) -> None:
         raise ValueError(f"{what} must be {wanted}, got {shown(value)}")
 
 
-def is_number(value: Any) -> bool:
+def is_number(value: Any) -> TypeGuard[float]:
     """Whether it is a finite number."""
     if not isinstance(value, _NUMBERS) or isinstance(value, bool):
         return False
@@ -166,7 +166,7 @@ def is_number(value: Any) -> bool:
         return False
 
 
-def is_limit(value: Any) -> bool:
+def is_limit(value: Any) -> TypeGuard[float]:
     """Whether it is a number, or infinite for no limit."""
     return is_number(value) or (isinstance(value, float | np.floating) and math.isinf(value))
 

@@ -6,7 +6,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from quad_envs import cooperative_estimation_v0, formation_v0, target_tracking_v0
+from baselines import evaluate, make_policy, run_benchmark
+from baselines.certify import certify
+from baselines.suite import EnvChoice, PolicyChoice, Suite
+from baselines.training.plans import make_plan
+from quad_envs import checks, cooperative_estimation_v0, formation_v0, target_tracking_v0
 from quad_envs.checks import Bound, require_memory, require_number, require_whole
 from quad_envs.disturbances import Gusts, Steady
 from quad_envs.envs.options import TrackingOptions
@@ -365,3 +369,87 @@ def test_lists_in_lists_without_end_are_refused():
     for name in ("start", "Q", "inertia", "position_limit"):
         with pytest.raises(ValueError, match="more than 20 deep"):
             gym.make(HELIX, **{name: _nested(5000)})
+
+
+# ---- Controllers, evaluations, trainings.
+
+
+@pytest.mark.parametrize("policy", ["lmpc", "sdc-nmpc", "nmpc"])
+@pytest.mark.parametrize("horizon", [1001, 10**6, 10**60])
+def test_horizons_that_no_solver_holds_are_refused_with_their_memory(policy, horizon):
+    task = TrackingOptions(preview=2000).task
+    with pytest.raises(ValueError, match=r"horizon must be .* from 1 to 1000, got .* GiB of memory"):
+        make_policy(policy, task, horizon=horizon)
+
+
+@pytest.mark.parametrize(
+    ("policy", "option", "value"),
+    [
+        ("nmpc", "passes", 10**9),
+        ("sdc-nmpc", "relinearisations", 10**9),
+        ("lmpc", "iteration_limit", 10**60),
+        ("lmpc", "Q", 1e300),
+        ("lmpc", "Q", True),
+        ("lmpc", "R", [1.0, 1.0, True, 1.0]),
+        ("lmpc", "terminal", True),
+        ("lmpc", "plan_tilt", True),
+        ("lmpc", "horizon", True),
+        ("lmpc", "soft_weight", True),
+        ("sdc-nmpc", "relinearisations", True),
+    ],
+)
+def test_options_of_controllers_are_bounded_numbers_too(policy, option, value):
+    with pytest.raises(ValueError, match=option):
+        make_policy(policy, HELIX, **{option: value})
+
+
+def test_a_terminal_weight_may_be_a_matrix_in_make_policy_too():
+    terminal = 3.0 * np.eye(12)
+    assert (make_policy("lmpc", HELIX, terminal=terminal).controller._data.P == terminal).all()
+
+
+def test_a_central_mpc_says_the_memory_of_its_dense_matrices(monkeypatch):
+    monkeypatch.setattr(checks, "_machine_memory", lambda: 2.0**30)
+    team = formation_v0.parallel_env(preview=600)
+    with pytest.raises(ValueError, match=r"horizon 600 would take 1\.54 GiB .* shorter horizon"):
+        make_policy("central-mpc", team, horizon=600)
+
+
+@pytest.mark.parametrize("value", [0, True, 2.5, 10**6, 10**60])
+def test_numbers_of_flights_processes_and_starts_are_bounded(value):
+    with pytest.raises(ValueError, match="episodes must be a whole number"):
+        evaluate("hover", HELIX, episodes=value)
+    with pytest.raises(ValueError, match=r"episodes of suite .* must be a whole number"):
+        Suite("mine", (EnvChoice(HELIX),), (PolicyChoice("hover"),), episodes=value)
+    with pytest.raises(ValueError, match="jobs must be a whole number"):
+        run_benchmark("quick", jobs=value)
+    with pytest.raises(ValueError, match="starts must be a whole number"):
+        certify(REGULATION, "lqr", starts=value)
+
+
+def test_processes_that_the_memory_does_not_hold_are_refused(monkeypatch):
+    monkeypatch.setattr(checks, "_machine_memory", lambda: 4.0 * 2.0**30)
+    with pytest.raises(ValueError, match=r"1000 processes would take 186 GiB .*: choose fewer jobs"):
+        run_benchmark("quick", jobs=1000)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "hyper"),
+    [
+        ("ppo", {"rows": 10**9}),
+        ("ppo", {"horizon": 10**60}),
+        ("ppo", {"batch": 10**60}),
+        ("ppo", {"hidden": [10**9]}),
+        ("ppo", {"hidden": [64] * 1000}),
+        ("ppo-lagrangian", {"probes": 10**9}),
+        ("sac", {"memory": 10**12}),
+        ("apg", {"flights": 10**9}),
+        ("apg", {"substeps": 10**9}),
+        ("dagger", {"window": 10**9}),
+        ("dagger", {"fits": 10**60}),
+        ("ppo", {"rows": 100_000, "horizon": 10_000}),
+    ],
+)
+def test_hyperparameters_that_no_machine_holds_are_refused(algorithm, hyper):
+    with pytest.raises(ValueError, match=f"{next(iter(hyper))}|observations of"):
+        make_plan(HELIX, algorithm, steps=1000, hyper=hyper)

@@ -17,6 +17,7 @@ from controllers.invariant import (
 )
 from controllers.model import hover_pair
 from controllers.riccati import lqr_gain
+from quad_envs.checks import require_whole
 from quad_envs.parameters import Array
 
 from ..environments import make_env
@@ -29,6 +30,7 @@ from .verdicts import Certificate
 
 CERTIFIABLE = ("lmpc", "sdc-nmpc", "sdre", "lqr", "nmpc")  # the last one at hover alone
 _AT_HOVER_ALONE = ("nmpc",)
+_MOST_STARTS, _START_BYTES = 100_000, 10_000  # plants, windows and memories of an MPC
 _LARGEST = "largest-ellipsoid", "Largest invariant ellipsoid inside the limits (max log det, LMI)"
 _INSCRIBED = "ellipsoid", "Invariant ellipsoid of the Riccati weight inside the limits"
 
@@ -96,8 +98,8 @@ def certify(
     Raises:
         ValueError: If a name or an option is not allowed, or the policy has no terminal weight to certify.
     """
-    if isinstance(starts, bool) or not isinstance(starts, int) or starts < 2:
-        raise ValueError(f"starts must be a whole number >= 2, got {starts!r}")
+    require_whole("seed", seed, 0)
+    require_whole("starts", starts, 2, _MOST_STARTS, lambda n: n * _START_BYTES)
     options = dict(policy_kwargs or {})
     _require_certifiable(policy_name, options)
     env, policy = _make(env_id, policy_name, dict(env_kwargs or {}), options)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from quad_envs.names import unknown_name
 
+from ..checks import require_jobs
 from ..figures import house_style
 from ..results import write_atomic
 from . import estimation_claims, estimation_tables, formation_claims, formation_tables, page, target_claims
@@ -98,8 +99,7 @@ def sections(what: Sequence[str] = (), jobs: int = 1, out: Path | None = None) -
         MissingPackageError: If figures are asked for and matplotlib is not installed; at once, too.
     """
     names = section_names(what, out is not None)
-    if isinstance(jobs, bool) or not isinstance(jobs, int) or jobs < 1:
-        raise ValueError(f"jobs must be a whole number >= 1, got {jobs!r}")
+    require_jobs(jobs)
     if any(name in FIGURE_SECTIONS for name in names):
         with house_style():
             pass

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from quad_envs.checks import require_memory, require_whole
+from quad_envs.names import shown
 
 if TYPE_CHECKING:
     from .networks import Squash
@@ -13,6 +16,18 @@ _POSITIVE = (
     *("rows", "horizon", "batch", "epochs", "learning_rate", "final_rate", "discount", "clip"),
     *("gradient_norm", "gradient_steps", "memory", "smoothing", "probes"),
 )
+# Hyperparameters that take memory or time, and the largest that make sense.
+_MOST = {
+    **dict.fromkeys(("rows", "flights", "probes"), 100_000),
+    **dict.fromkeys(("horizon", "final_horizon", "window"), 10_000),
+    **dict.fromkeys(("epochs", "gradient_steps", "substeps"), 1_000),
+    **dict.fromkeys(("fits", "final_fits", "critic_updates", "episode_steps"), 1_000_000),
+    "batch": 10_000_000,
+    "memory": 100_000_000,
+    "warm_up": 1_000_000_000,
+}
+_MAY_BE_NONE = ("fits", "final_fits", "critic_updates", "warm_up")
+_WIDEST, _MOST_LAYERS = 10_000, 20
 _SHARES = ("free", "final_rate", "discount", "trace", "smoothing")
 
 
@@ -111,6 +126,36 @@ class SacOptions:
 
     def __post_init__(self) -> None:
         _check_numbers(self)
+
+
+def check_sizes(options: Any, width: int) -> None:
+    """Refuse sizes that no machine holds, before anything is made.
+
+    Args:
+        options: Hyperparameters of any algorithm.
+        width: Numbers in an observation.
+
+    Raises:
+        ValueError: If there is one; the message has the memory that it would take.
+    """
+    for one in fields(options):
+        value = getattr(options, one.name)
+        if value is not None and one.name in _MOST:
+            least, most = int(one.name not in _MAY_BE_NONE), _MOST[one.name]
+            require_whole(f"hyperparameter {one.name}", value, least, most, lambda n: 4 * n * width)
+    hidden = options.hidden
+    if len(hidden) > _MOST_LAYERS:
+        raise ValueError(f"hyperparameter hidden has at most {_MOST_LAYERS} layers, got {shown(hidden)}")
+    for n in hidden:
+        require_whole("a layer of hyperparameter hidden", n, 1, _WIDEST, lambda n: 4 * n * (n + width))
+    rows = getattr(options, "rows", getattr(options, "flights", 1))
+    stages = getattr(options, "horizon", getattr(options, "window", 1))
+    kept = rows * stages + 2 * getattr(options, "memory", 0)
+    require_memory(
+        f"training with {kept} observations of {width} numbers at a time",
+        4 * kept * width,
+        "lower the hyperparameters rows, horizon or memory",
+    )
 
 
 def _check_numbers(options: PpoOptions | SacOptions) -> None:

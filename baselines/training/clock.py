@@ -11,6 +11,9 @@ from typing import Any
 
 from numba.core import event
 
+from quad_envs.kinds import is_number
+from quad_envs.names import shown
+
 _COMPILING = "numba:compile"
 
 
@@ -31,10 +34,9 @@ class Budget:
         for name, value in (("seconds", self.seconds), ("steps", self.steps)):
             if value is None:
                 continue
-            number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-            if not number or value <= 0 or (name == "steps" and int(value) != value):
+            if not is_number(value) or value <= 0 or (name == "steps" and int(value) != value):
                 kind = "a whole number" if name == "steps" else "a number"
-                raise ValueError(f"{name} of training must be {kind} > 0, got {value!r}")
+                raise ValueError(f"{name} of training must be {kind} > 0, got {shown(value)}")
 
     def share(self, seconds: float, steps: int) -> float:
         """Share that is used up, >= 0."""

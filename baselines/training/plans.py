@@ -7,9 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from quad_envs.names import shown
+
 from ..errors import ResultsError
 from ..policy import mission_of
 from ..trained import checkpoint_folder
+from .algorithm_options import check_sizes
 from .algorithms import algorithm_for, require_packages, require_resumable
 from .checkpoints import load_checkpoint
 from .clock import Budget
@@ -73,8 +76,8 @@ def make_plan(
     """
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < _SEEDS:
         raise ValueError(
-            f"seed of a training must be a whole number, 0 to {_SEEDS - 1}, got {seed!r}; later ones are "
-            "held out for evaluation"
+            f"seed of a training must be a whole number, 0 to {_SEEDS - 1}, got {shown(seed)}; later ones "
+            "are held out for evaluation"
         )
     kwargs = dict(env_kwargs or {})
     task_options = training_options(env_id, kwargs)
@@ -84,6 +87,7 @@ def make_plan(
     require_packages(algorithm)
     env_id = env_id.removeprefix("quad_envs:")
     options = hyperparameters(algorithm, env_id, hyper)
+    check_sizes(options, task_options.task.layout.size)
     network, origin = (None, None) if start_from is None else _origin(start_from, algorithm)
     texts = assignments(kwargs), assignments(hyper or {}), str(start_from or "")
     about = {

@@ -17,10 +17,11 @@ import numpy as np
 import osqp
 import scipy.sparse as sparse
 
+from quad_envs.checks import require_whole
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 
 from ..ocp import IntArray, OcpQp, first_move_bounds, validate
-from .solution import Multipliers, Solution, Status, residuals
+from .solution import MOST_ITERATIONS, Multipliers, Solution, Status, residuals
 
 _SOLVED, _INACCURATE, _INFEASIBLE = 1, 2, (3, 4)
 _NO_BOUND = 1e30  # OSQP's infinity
@@ -212,8 +213,7 @@ class OsqpSolver:
     ) -> None:
         if not eps > 0.0:
             raise ValueError(f"eps must be > 0, got {eps}")
-        if max_iter < 1:
-            raise ValueError(f"max_iter must be at least 1, got {max_iter}")
+        require_whole("max_iter", max_iter, 1, MOST_ITERATIONS)
         self.settings: dict[str, Any] = {
             "eps_abs": eps,
             "eps_rel": eps,

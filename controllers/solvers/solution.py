@@ -11,6 +11,8 @@ from quad_envs.parameters import N_INPUT, Array
 
 from ..ocp import OcpQp, first_move_bounds
 
+MOST_ITERATIONS = 10**9  # that a limit may allow; solvers count in 32 bits
+
 
 class Status(IntEnum):
     """How a solve ended. Only OPTIMAL comes with a plan that may be flown."""

@@ -79,7 +79,7 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
         `reveal_disturbance` (puts its mean over the coming period into the observation), `sensor_noise`
         (standard deviations of position m, velocity m/s, attitude rad, rates rad/s, or one number for all),
         `randomize` (relative spread of mass, inertia, arm, kappa, rotor_rate, drag at reset: a mapping or
-        one number for all).
+        one number for all; the largest principal moment is at most the sum of the others).
 
     Rendering: `render_mode` None or "rgb_array" (`gymnasium.make` makes "human" of it), `render_size`
         (640, 480) pixels.
