@@ -174,6 +174,9 @@ def plan_cost(qp: OcpQp, u: Array, x: Array) -> float:
     e = x - qp.r
     Q = qp.Q if len(qp.Q) > 1 else np.broadcast_to(qp.Q, (N, *qp.Q.shape[1:]))
     cost = np.einsum("ia,iab,ib", e[:N], Q, e[:N]) + np.einsum("ia,ab,ib", u, qp.R, u) + e[N] @ qp.Q_f @ e[N]
+    if qp.R_rate is not None:
+        change = np.diff(u, axis=0, prepend=qp.u_last[None])
+        cost += np.einsum("ia,ab,ib", change, qp.R_rate, change)
     rows = qp.rows
     if len(rows.weight):
         z = np.einsum("ka,ka->k", rows.normals[rows.normal], x[rows.stage])

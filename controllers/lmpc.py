@@ -91,6 +91,8 @@ class LinearMPC(Mpc):
         plan_tilt: Largest roll and pitch of a plan, rad, besides the task's limit: where the model holds.
             None stands for 0.8 in frame "heading" and no such limit in frame "hover".
         terminal: Factor of P, the weight of x_N, or a matrix (12, 12) in its place.
+        R_rate: Weight of the changes of the forces from sample to sample, the first one against the command
+            applied before; a number, the diagonal (4,) or a matrix. None: changes cost nothing.
 
     Raises:
         ValueError: If an option is not allowed.
@@ -113,6 +115,7 @@ class LinearMPC(Mpc):
         R: ArrayLike | None = None,
         plan_tilt: float | None = None,
         terminal: ArrayLike = 1.0,
+        R_rate: ArrayLike | None = None,
     ) -> None:
         options = MpcOptions(
             solver,
@@ -127,6 +130,7 @@ class LinearMPC(Mpc):
             R,
             default_tilt(plan_tilt, PLAN_TILT, frame),
             terminal,
+            R_rate,
         )
         super().__init__(task, horizon, options, pairs=1, guess=False)
         self._data = self._data._replace(first_angle=ATTITUDE.start + 2)

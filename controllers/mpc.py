@@ -36,7 +36,7 @@ from .riccati import dare
 from .solvers import Backend, Status, StructuredSolver
 from .solvers.solution import MOST_ITERATIONS
 from .solvers.structured import Workspace, make_workspace
-from .weights import require_turnable, terminal_weight, weight_matrix
+from .weights import change_weight, require_turnable, terminal_weight, weight_matrix
 
 SolverName = Literal["structured", "osqp"]
 Frame = Literal["heading", "hover"]
@@ -77,6 +77,7 @@ class MpcOptions:
     R: ArrayLike | None = None  # weight of the forces: number, diagonal (4,) or matrix; None: the reward's
     plan_tilt: float = math.inf  # rad, largest roll and pitch of a plan, for the sake of its model
     terminal: ArrayLike = 1.0  # factor of P, the weight of x_N, or a matrix (12, 12) in the problem's axes
+    R_rate: ArrayLike | None = None  # weight of the changes of the forces, as R; None: none
 
     def __post_init__(self) -> None:
         require_choice("solver", self.solver, SolverName)
@@ -171,6 +172,7 @@ def mpc_data(task: BaseTask, horizon: int, options: MpcOptions) -> MpcData:
         B_c=params.input_matrix(),
         Q=np.ascontiguousarray(Q[None]),
         R=R,
+        R_rate=change_weight(options.R_rate),
         P=P,
         normals=rows.normals,
         axis=np.r_[axis, np.full(len(tilted.normals), -1, np.int64)],
@@ -268,7 +270,8 @@ class Mpc(ABC):
         begin_row(*row, which, self._data, s)
         qp = self._as_qp(self._pose(0, row[-1], s, ws), s, *self._row_sets()[0])
         rows = StateRows._make(np.array(value) for value in qp.rows)
-        return OcpQp._make(np.array(v) if isinstance(v, np.ndarray) else v for v in (*qp[:-1], rows))
+        qp = qp._replace(rows=rows)
+        return OcpQp._make(np.array(v) if isinstance(v, np.ndarray) else v for v in qp)
 
     @abstractmethod
     def _decide_rows(self, *arrays: Any) -> int:
@@ -291,7 +294,7 @@ class Mpc(ABC):
             self._workspace = (
                 np.zeros(1, np.int64) if self.options.reject_disturbance else None,
                 np.zeros(buffer_size(self.horizon, *self._sizes())),
-                make_workspace(self.horizon, len(self._data.normal), self._pairs),
+                make_workspace(self.horizon, len(self._data.normal), self._pairs, len(self._data.R_rate) > 0),
             )
         return self._workspace
 
@@ -380,7 +383,7 @@ class Mpc(ABC):
         )
         return OcpQp(
             *problem[:2], s.c, problem.Q, self._data.R, *problem[3:5], s.x_0, problem.r, s.lower, s.upper,
-            self._data.rate_step, s.u_last, rows,
+            self._data.rate_step, s.u_last, rows, data.R_rate if len(data.R_rate) else None,
         )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:

@@ -41,6 +41,7 @@ class MpcData(NamedTuple):
     B_c: Array  # (12, 4)
     Q: Array  # (1, 12, 12)
     R: Array  # (4, 4)
+    R_rate: Array  # (4, 4), or (0, 4) for none
     P: Array  # (12, 12), weight of x_N: solves the Riccati equation of the hover pair
     normals: Array  # (H, 12), outputs with limits
     axis: IntArray  # (H,), 0..2 where the output is that coordinate of the position, else -1
@@ -416,7 +417,7 @@ def solve_row(
         status, count = solve_structured(
             A, B, s.c, Q, data.R, Q_f, stationary, s.x_0, r, s.lower, s.upper, rate_step, s.u_last,
             s.normals[:H], data.normal[:K], stage, s.row_lower[:K], s.row_upper[:K], s.weight[:K],
-            data.iteration_limit, warm, ws,
+            data.R_rate, data.iteration_limit, warm, ws,
         )  # fmt: skip
         iterations += count
         if status == OPTIMAL:

@@ -296,6 +296,8 @@ class ExactNmpc(Mpc):
         plan_tilt: Largest roll and pitch of a plan, rad, besides the task's limit: where the model holds.
             None stands for 1.0 in frame "heading" and no such limit in frame "hover".
         terminal: Factor of P, the weight of x_N, or a matrix (12, 12) in its place.
+        R_rate: Weight of the changes of the forces from sample to sample, the first one against the command
+            applied before; a number, the diagonal (4,) or a matrix. None: changes cost nothing.
 
     Raises:
         ValueError: If an option is not allowed.
@@ -319,12 +321,13 @@ class ExactNmpc(Mpc):
         R: ArrayLike | None = None,
         plan_tilt: float | None = None,
         terminal: ArrayLike = 1.0,
+        R_rate: ArrayLike | None = None,
     ) -> None:
         require_whole("passes", passes, 1, MOST_PASSES)
         require_choice("velocity_error", velocity_error, VelocityError)
         options = MpcOptions(
             solver, frame, "heading", soft_weight, margin, reject_disturbance, estimator_gain,
-            iteration_limit, Q, R, default_tilt(plan_tilt, EXACT_TILT, frame), terminal,
+            iteration_limit, Q, R, default_tilt(plan_tilt, EXACT_TILT, frame), terminal, R_rate,
         )  # fmt: skip
         super().__init__(task, horizon, options, pairs=horizon, guess=True)
         self._data = self._data._replace(model_tilt=EXACT_TILT)

@@ -2,7 +2,8 @@
 
 With u = F - u_T, over u_0 .. u_{N-1} and with x_0 given:
 
-    minimise    1/2 [ sum_{i<N} |x_i - r_i|^2_Q_i + |u_i|^2_R  +  |x_N - r_N|^2_Qf ]  +  sum_k weight_k s_k
+    minimise    1/2 [ sum_{i<N} |x_i - r_i|^2_Q_i + |u_i|^2_R + |u_i - u_{i-1}|^2_S  +  |x_N - r_N|^2_Qf ]
+                + sum_k weight_k s_k
     subject to  x_{i+1} = A_i x_i + B_i u_i + c_i
                 lower <= u_i <= upper
                 |u_i - u_{i-1}| <= rate_step,  u_{-1} = u_last
@@ -45,7 +46,7 @@ class OcpQp(NamedTuple):
     Q: Array  # (1 or N, 12, 12), stages 0..N-1
     R: Array  # (4, 4)
     Q_f: Array  # (12, 12)
-    stationary: bool  # Q_f solves the DARE of the single (A, B) and Q: one gain serves all stages
+    stationary: bool  # Q_f solves the DARE of the single (A, B) and Q: one gain serves all without R_rate
     x_0: Array  # (12,)
     r: Array  # (N+1, 12)
     lower: Array  # (4,), N
@@ -53,6 +54,7 @@ class OcpQp(NamedTuple):
     rate_step: float  # N per sample, inf for no limit
     u_last: Array  # (4,), N, the last applied input
     rows: StateRows
+    R_rate: Array | None = None  # (4, 4), S of the changes u_i - u_{i-1}, u_{-1} = u_last; None: none
 
 
 class Condensed(NamedTuple):
@@ -135,6 +137,11 @@ def first_move_bounds(qp: OcpQp) -> tuple[Array, Array]:
     )
 
 
+def rate_weight(qp: OcpQp) -> Array:
+    """`qp.R_rate` as compiled code takes it: (0, 4) for none."""
+    return np.zeros((0, N_INPUT)) if qp.R_rate is None else qp.R_rate
+
+
 def condense(qp: OcpQp) -> Condensed:
     """Eliminate the states: S_{i+1} = A_i S_i + [0 .. B_i .. 0], f_{i+1} = A_i f_i + c_i, f_0 = x_0.
 
@@ -152,6 +159,10 @@ def condense(qp: OcpQp) -> Condensed:
         f[i + 1] = qp.A[j] @ f[i] + qp.c[i]
     H = np.asarray(np.kron(np.eye(N), qp.R), dtype=np.float64)
     g = np.zeros(nv)
+    if qp.R_rate is not None:
+        change = np.eye(N) - np.eye(N, k=-1)
+        H += np.kron(change.T @ change, qp.R_rate)
+        g[:N_INPUT] -= qp.R_rate @ qp.u_last
     for i in range(1, N + 1):
         W = qp.Q_f if i == N else qp.Q[i if len(qp.Q) > 1 else 0]
         H += S[i].T @ W @ S[i]
@@ -219,7 +230,7 @@ def _validate_rows(rows: StateRows, horizon: int) -> None:
 
 
 def validate(qp: OcpQp) -> None:
-    """Check everything a solver relies on, except that Q and Q_f are positive semidefinite.
+    """Check everything a solver relies on, except that Q, Q_f and R_rate are positive semidefinite.
 
     Raises:
         ValueError: If a shape, type or layout is wrong, a number is not finite where it must be, bounds
@@ -242,6 +253,9 @@ def validate(qp: OcpQp) -> None:
     _require_array("upper", qp.upper, ((m,),), infinite=True)
     _require_array("u_last", qp.u_last, ((m,),))
     _require_ordered("input box", qp.lower, qp.upper)
+    if qp.R_rate is not None:
+        _require_array("R_rate", qp.R_rate, ((m, m),))
+        _require_symmetric("R_rate", qp.R_rate)
     for name in ("Q", "R", "Q_f"):
         _require_symmetric(name, getattr(qp, name))
     smallest = float(np.linalg.eigvalsh(qp.R)[0])

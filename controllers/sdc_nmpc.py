@@ -205,6 +205,8 @@ class SdcNmpc(Mpc):
         plan_tilt: Largest roll and pitch of a plan, rad, besides the task's limit: where the model holds.
             None stands for 0.8 in frame "heading" and no such limit in frame "hover".
         terminal: Factor of P, the weight of x_N, or a matrix (12, 12) in its place.
+        R_rate: Weight of the changes of the forces from sample to sample, the first one against the command
+            applied before; a number, the diagonal (4,) or a matrix. None: changes cost nothing.
 
     Raises:
         ValueError: If an option is not allowed.
@@ -230,6 +232,7 @@ class SdcNmpc(Mpc):
         R: ArrayLike | None = None,
         plan_tilt: float | None = None,
         terminal: ArrayLike = 1.0,
+        R_rate: ArrayLike | None = None,
     ) -> None:
         if not 0.0 <= alpha <= 1.0:
             raise ValueError(
@@ -254,6 +257,7 @@ class SdcNmpc(Mpc):
             R,
             default_tilt(plan_tilt, PLAN_TILT, frame),
             terminal,
+            R_rate,
         )
         if terminal_weight == "sdre" and (np.ndim(terminal) > 0 or terminal != 1.0):
             raise ValueError(

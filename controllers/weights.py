@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from quad_envs.kinds import holds_booleans, is_number
 from quad_envs.names import shown
-from quad_envs.parameters import MOST_WEIGHT, Array
+from quad_envs.parameters import MOST_WEIGHT, N_INPUT, Array
 from quad_envs.rotations import sincos
 
 _SYMMETRY = 1e-9  # relative, what two ways of summing the same matrix may differ by
@@ -51,6 +51,18 @@ def weight_matrix(name: str, value: ArrayLike, size: int, *, definite: bool) -> 
         kind = "positive definite" if definite else "positive semidefinite"
         raise ValueError(f"{name} must be {kind}, its smallest eigenvalue is {smallest:.6g}")
     return np.ascontiguousarray(matrix)
+
+
+def change_weight(value: ArrayLike | None) -> Array:
+    """The weight of changes of the rotor forces, (4, 4), or (0, 4) for none: None, or zeros.
+
+    Raises:
+        ValueError: As `weight_matrix`.
+    """
+    if value is None:
+        return np.zeros((0, N_INPUT))
+    matrix = weight_matrix("R_rate", value, N_INPUT, definite=False)
+    return matrix if matrix.any() else matrix[:0]
 
 
 def terminal_weight(value: ArrayLike, P: Array) -> Array:

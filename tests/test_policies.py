@@ -125,7 +125,7 @@ def test_an_option_that_mpcs_share_has_one_default():
     linear, *others = (policy_options(name) for name in ("lmpc", "sdc-nmpc", "nmpc"))
     for other in others:
         shared = (linear.keys() & other.keys()) - {"velocity_reference"}  # lmpc alone gains by "attitude"
-        assert len(shared) == 12
+        assert len(shared) == 13
         assert [linear[name] for name in shared] == [other[name] for name in shared]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from ocp_problems import LIMITS, MODELS, hover_qp, random_qp, tilt_rows, velocity_rows
 
-from controllers.ocp import StateRows, concatenate_rows, condense, first_move_bounds, output_rows
+from controllers.ocp import StateRows, concatenate_rows, condense, first_move_bounds, output_rows, rate_weight
 from controllers.riccati import RICCATI_SCRATCH, optimal_plan, riccati_pass
 from controllers.solvers import Status, StructuredSolver, residuals
 from controllers.solvers.structured import inverse_factor, make_workspace, solve_structured
@@ -112,7 +112,7 @@ def test_the_unconstrained_plan_is_the_solution_of_the_condensed_system(model):
 def test_the_inverse_factor_whitens_the_hessian(model, N):
     qp = random_qp(np.random.default_rng(8), N, model, "none")
     ws = make_workspace(N, 0, len(qp.A))
-    solve_structured(*qp[:-1], *qp.rows, 1, False, ws)
+    solve_structured(*qp[:-2], *qp.rows, rate_weight(qp), 1, False, ws)
     J_T = np.empty((4 * N, 4 * N))
     inverse_factor(ws.K, ws.D, ws.A_cl, qp.B, qp.stationary, J_T, ws.wide)
     H = condense(qp).H
@@ -234,14 +234,14 @@ def test_a_number_that_is_not_finite_is_a_status_of_the_kernel(field):
     broken = getattr(qp, field).copy()
     broken.flat[0] = np.nan
     qp = qp._replace(**{field: broken})
-    status, _ = solve_structured(*qp[:-1], *qp.rows, 100, False, make_workspace(5, 0, 1))
+    status, _ = solve_structured(*qp[:-2], *qp.rows, rate_weight(qp), 100, False, make_workspace(5, 0, 1))
     assert status == Status.NOT_FINITE
 
 
 def test_a_workspace_of_another_horizon_is_refused():
     qp = hover_qp(5, FAR)
     with pytest.raises(ValueError, match="workspace does not fit"):
-        solve_structured(*qp[:-1], *qp.rows, 100, False, make_workspace(4, 0, 1))
+        solve_structured(*qp[:-2], *qp.rows, rate_weight(qp), 100, False, make_workspace(4, 0, 1))
 
 
 def test_repeated_solves_in_one_workspace_are_bitwise_equal():

@@ -7,6 +7,7 @@ from ocp_problems import LIMITS, MODELS, random_qp
 
 import quad_envs  # noqa: F401  registers the ids
 from baselines import check_policy, make_policy
+from controllers.ocp import rate_weight
 from controllers.solvers import Status, StructuredSolver
 from controllers.solvers.structured import ITERATION_LIMIT, make_workspace, solve_structured, step_limit
 from controllers.solvers.working_set import DIGITS, pack_working_set, unpack_working_set
@@ -20,7 +21,9 @@ def solve_from(qp, guess):
     ws = make_workspace(N, K, len(qp.A))
     if guess is not None:
         ws.guess[:] = guess
-    status, steps = solve_structured(*qp[:-1], *qp.rows, ITERATION_LIMIT, guess is not None, ws)
+    status, steps = solve_structured(
+        *qp[:-2], *qp.rows, rate_weight(qp), ITERATION_LIMIT, guess is not None, ws
+    )
     return Status(status), steps, ws.u.copy(), ws.state.copy()
 
 

@@ -174,6 +174,11 @@ def _require_certifiable(name: str, options: Mapping[str, Any]) -> None:
             f"policy {name!r} has no terminal weight and no gain of a Riccati equation that chapter 9 could "
             f"certify; those that have: {', '.join(CERTIFIABLE)}"
         )
+    if options.get("R_rate") is not None:
+        raise ValueError(
+            "R_rate makes the cost depend on the command before, of which the terminal cost of chapter "
+            "9 knows nothing: certify without it"
+        )
     if options.get("relinearisations"):
         raise ValueError(
             f"relinearisations={options['relinearisations']!r} takes new matrices along the plan, chapter 9 "

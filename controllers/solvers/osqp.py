@@ -115,14 +115,16 @@ def _constraint_values(qp: OcpQp, n_soft: int) -> Array:
     )
 
 
-def _cost_pattern(N: int, n_soft: int) -> _Pattern:
-    """Upper triangle of blkdiag(R, Q_1, R, Q_2, .., R, Q_f, 0)."""
+def _cost_pattern(N: int, n_soft: int, weighs_changes: bool) -> _Pattern:
+    """Upper triangle of blkdiag(R, Q_1, R, Q_2, .., R, Q_f, 0), and the blocks of u_i and u_{i+1}."""
     size = _STAGE * N + n_soft
     parts = []
     for i in range(N):
         for start, width in ((_input(i), N_INPUT), (_state(i + 1), N_STATE)):
             row, column = np.triu_indices(width)
             parts.append((row + start, column + start))
+    if weighs_changes:
+        parts += [_block(_input(i), _input(i + 1), N_INPUT, N_INPUT) for i in range(N - 1)]
     return _join(parts, (size, size))
 
 
@@ -136,12 +138,20 @@ def _state_weights(qp: OcpQp) -> Array:
 def _cost_values(qp: OcpQp) -> Array:
     R = qp.R[np.triu_indices(N_INPUT)]
     W = _state_weights(qp)[(slice(None), *np.triu_indices(N_STATE))]
-    return np.concatenate([np.tile(R, (len(W), 1)), W], axis=1).ravel()
+    inputs = np.tile(R, (len(W), 1))
+    if qp.R_rate is None:
+        return np.concatenate([inputs, W], axis=1).ravel()
+    changes = np.r_[np.full(len(W) - 1, 2.0), 1.0]  # that u_i is part of
+    inputs += changes[:, None] * qp.R_rate[np.triu_indices(N_INPUT)]
+    between = np.tile(-qp.R_rate.ravel(), len(W) - 1)
+    return np.concatenate([np.concatenate([inputs, W], axis=1).ravel(), between])
 
 
 def _linear_cost(qp: OcpQp, soft: IntArray) -> Array:
     pull = -np.einsum("iab,ib->ia", _state_weights(qp), qp.r[1:])
     stages = np.concatenate([np.zeros((len(qp.c), N_INPUT)), pull], axis=1)
+    if qp.R_rate is not None:
+        stages[0, :N_INPUT] -= qp.R_rate @ qp.u_last
     return np.concatenate([stages.ravel(), qp.rows.weight[soft]])
 
 
@@ -168,7 +178,8 @@ class _Problem:
         self.soft = np.flatnonzero(np.isfinite(qp.rows.weight))
         self.stage = qp.rows.stage.copy()
         N = len(qp.c)
-        cost = _cost_pattern(N, len(self.soft))
+        self.weighs_changes = qp.R_rate is not None
+        cost = _cost_pattern(N, len(self.soft), self.weighs_changes)
         constraints = _constraint_pattern(N, self.stage, self.soft)
         P, self.cost_order = cost.compile(_cost_values(qp))
         A, self.constraint_order = constraints.compile(_constraint_values(qp, len(self.soft)))
@@ -180,6 +191,7 @@ class _Problem:
         """Whether the new problem has the structure of this one."""
         return (
             len(qp.c) == horizon
+            and (qp.R_rate is not None) == self.weighs_changes
             and np.array_equal(qp.rows.stage, self.stage)
             and np.array_equal(np.flatnonzero(np.isfinite(qp.rows.weight)), self.soft)
         )

@@ -113,6 +113,10 @@ def _gradient(qp: OcpQp, u: Array, x: Array, pull: Array) -> Array:
     for i in range(N - 1, -1, -1):
         j = i if len(qp.A) > 1 else 0
         gradient[i] = qp.R @ u[i] + qp.B[j].T @ costate
+        if qp.R_rate is not None:
+            gradient[i] += qp.R_rate @ (u[i] - (u[i - 1] if i else qp.u_last))
+            if i + 1 < N:
+                gradient[i] -= qp.R_rate @ (u[i + 1] - u[i])
         costate = qp.Q[i if len(qp.Q) > 1 else 0] @ (x[i] - qp.r[i]) + qp.A[j].T @ costate - force[i]
     return gradient
 

@@ -85,6 +85,17 @@ def _roll_out(c: Array, x_0: Array, transposed: Array, u: Array, x: Array) -> No
 
 
 @kernel
+def _pull_of_changes(S: Array, u_last: Array, u: Array, i: int, a: int) -> tuple[float, float]:
+    """Entry a of S (u_i - u_{i-1}) and of S (u_{i+1} - u_i), the latter 0 at the end of the horizon."""
+    before, after = 0.0, 0.0
+    for b in range(S.shape[0]):
+        before += S[a, b] * (u[i, b] - (u[i - 1, b] if i > 0 else u_last[b]))
+        if i + 1 < u.shape[0]:
+            after += S[a, b] * (u[i + 1, b] - u[i, b])
+    return before, after
+
+
+@kernel
 def lagrangian_gradient(
     A: Array,
     B: Array,
@@ -94,6 +105,8 @@ def lagrangian_gradient(
     Q_f: Array,
     x_0: Array,
     r: Array,
+    R_rate: Array,
+    u_last: Array,
     transposed: Array,
     rows: RowData,
     u: Array,
@@ -114,6 +127,8 @@ def lagrangian_gradient(
         Q_f: (12, 12).
         x_0: (12,).
         r: (N+1, 12).
+        R_rate: (4, 4), or (0, 4) where changes have no weight.
+        u_last: (4,).
         transposed: [A_i B_i]', (1 or N, 16, 12).
         rows: The rows of the problem.
         u: (N, 4).
@@ -124,7 +139,7 @@ def lagrangian_gradient(
         scratch: Overwritten, (>= 3, 12).
 
     Returns:
-        Its largest entry over 1 + the largest entry of its terms R u_i and B_i' y_{i+1}.
+        Its largest entry over 1 + the largest entry of its terms R u_i, B_i' y_{i+1} and S (u_i - u_{i-1}).
     """
     N, m = u.shape
     nv = N * m
@@ -151,6 +166,10 @@ def lagrangian_gradient(
             for b in range(m):
                 own += R[a, b] * u[i, b]
             scale = max(scale, 1.0 + abs(own), 1.0 + abs(gradient[k]))
+            if R_rate.shape[0] > 0:
+                before, after = _pull_of_changes(R_rate, u_last, u, i, a)
+                scale = max(scale, 1.0 + abs(before), 1.0 + abs(after))
+                own += before - after
             value = own + gradient[k] - multipliers[k] + multipliers[nv + k]
             value -= multipliers[2 * nv + k] - multipliers[3 * nv + k]
             if i + 1 < N:

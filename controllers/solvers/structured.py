@@ -19,8 +19,8 @@ import numpy as np
 from quad_envs._numba import kernel
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 
-from ..linalg import fill
-from ..ocp import IntArray, OcpQp, validate
+from ..linalg import fill, transpose
+from ..ocp import IntArray, OcpQp, rate_weight, validate
 from ..riccati import RICCATI_SCRATCH, optimal_plan, riccati_pass, step_plan
 from .active_set import (
     INACCURATE,
@@ -37,6 +37,7 @@ from .active_set import (
     row_spans,
     worst_row,
 )
+from .rate_weight import RateWorkspace, make_rate_workspace, rate_pass, rate_plan
 from .solution import Multipliers, Solution, Status
 from .stationarity import REFINED, STATIONARY, is_mild, lagrangian_gradient
 from .working_set import correct, start_from_guess
@@ -69,15 +70,17 @@ class Workspace(NamedTuple):
     spans: IntArray  # (K, 2)
     state: ByteArray  # (16N + 2K,), of every row at the end
     guess: ByteArray  # (16N + 2K,), of every row, to start from
+    rate: RateWorkspace  # of a weight on changes; may be empty
 
 
-def make_workspace(horizon: int, n_rows: int, n_models: int) -> Workspace:
+def make_workspace(horizon: int, n_rows: int, n_models: int, weighs_changes: bool = False) -> Workspace:
     """Memory for `solve_structured`.
 
     Args:
         horizon: N, exactly.
         n_rows: Largest number K of state rows.
         n_models: Number of pairs (A_i, B_i), 1 or N.
+        weighs_changes: Whether changes of the input may have a weight.
 
     Raises:
         ValueError: If a size is out of range.
@@ -110,6 +113,7 @@ def make_workspace(horizon: int, n_rows: int, n_models: int) -> Workspace:
         spans=np.zeros((n_rows, 2), dtype=np.int64),
         state=np.zeros(4 * nv + 2 * n_rows, dtype=np.int8),
         guess=np.zeros(4 * nv + 2 * n_rows, dtype=np.int8),
+        rate=make_rate_workspace(N, n_models, weighs_changes),
     )
 
 
@@ -186,6 +190,32 @@ def inverse_factor(
 
 
 @kernel
+def _recursion(
+    A: Array,
+    B: Array,
+    c: Array,
+    Q: Array,
+    R: Array,
+    Q_f: Array,
+    stationary: bool,
+    x_0: Array,
+    r: Array,
+    R_rate: Array,
+    u_last: Array,
+    ws: Workspace,
+) -> None:
+    """The backward pass over matrices, of x or, where changes have a weight, of [x; u_prev]."""
+    transposed, n = ws.transposed[: A.shape[0]], A.shape[1]
+    if R_rate.shape[0] == 0:
+        riccati_pass(A, B, c, Q, R, Q_f, stationary, transposed, ws.K, ws.D, ws.A_cl, ws.P_c, ws.scratch)
+        return
+    for j in range(A.shape[0]):
+        transpose(A[j], transposed[j, :n])
+        transpose(B[j], transposed[j, n:])
+    rate_pass(A, B, c, Q, R, Q_f, x_0, u_last, r, R_rate, ws.D, ws.rate)
+
+
+@kernel
 def _all_finite(values: Array) -> bool:
     bad = 0
     for i in range(values.shape[0]):
@@ -242,6 +272,8 @@ def _finish(
     Q_f: Array,
     x_0: Array,
     r: Array,
+    R_rate: Array,
+    u_last: Array,
     rows: RowData,
     q: int,
     ws: Workspace,
@@ -260,8 +292,8 @@ def _finish(
         _clear(ws.multipliers, n_rows)
         collect_multipliers(ws.state, ws.active, sign, nu, cap, rows.weight, q, 4 * u.size, ws.multipliers)
         relative = lagrangian_gradient(
-            A, B, c, Q, R, Q_f, x_0, r, transposed, rows, u, ws.multipliers, ws.states, ws.force, ws.gradient,
-            ws.scratch[1],
+            A, B, c, Q, R, Q_f, x_0, r, R_rate, u_last, transposed, rows, u, ws.multipliers, ws.states,
+            ws.force, ws.gradient, ws.scratch[1],
         )  # fmt: skip
         gap = _largest_gap(rows, q, ws)
         if attempt == 0 and relative <= REFINED and gap <= ROW_TOLERANCE:
@@ -281,6 +313,8 @@ def _solve_rows(
     stationary: bool,
     x_0: Array,
     r: Array,
+    R_rate: Array,
+    u_last: Array,
     rows: RowData,
     warm: bool,
     iterations: int,
@@ -290,7 +324,11 @@ def _solve_rows(
     """From the unconstrained optimum in ws to the constrained one; with `warm` by way of ws.guess."""
     u, x, transposed = ws.u, ws.x, ws.transposed[: A.shape[0]]
     J_T, R_T = ws.factors[0], ws.factors[1]
-    inverse_factor(ws.K, ws.D, ws.A_cl, B, stationary, J_T, ws.wide)
+    if R_rate.shape[0] > 0:
+        rate = ws.rate
+        inverse_factor(rate.K_u, ws.D, rate.A_cl, rate.B[: B.shape[0]], False, J_T, rate.wide)
+    else:
+        inverse_factor(ws.K, ws.D, ws.A_cl, B, stationary, J_T, ws.wide)
     q = 0
     _clear(ws.state, 4 * u.size + 2 * rows.normal.shape[0])
     if warm:
@@ -306,7 +344,7 @@ def _solve_rows(
     )  # fmt: skip
     if not (_all_finite(u) and _all_finite(x)):
         return NOT_FINITE, iterations
-    finished = _finish(A, B, c, Q, R, Q_f, x_0, r, rows, q, ws)
+    finished = _finish(A, B, c, Q, R, Q_f, x_0, r, R_rate, u_last, rows, q, ws)
     return (finished if status == OPTIMAL else status), iterations
 
 
@@ -331,6 +369,7 @@ def solve_structured(
     row_lower: Array,
     row_upper: Array,
     weight: Array,
+    R_rate: Array,
     iteration_limit: int,
     warm: bool,
     ws: Workspace,
@@ -361,6 +400,7 @@ def solve_structured(
         row_lower: (K,).
         row_upper: (K,).
         weight: (K,).
+        R_rate: (4, 4), or (0, 4) where changes have no weight. With one, `stationary` is not read.
         iteration_limit: As in `step_limit`.
         warm: Whether ws.guess[: 16N + 2K] holds a guess of the state of every row to start from.
         ws: From `make_workspace` for this N, at least K rows and at least this many pairs; ws.u, ws.x,
@@ -375,13 +415,16 @@ def solve_structured(
         ws.u.shape[0] != N
         or ws.spans.shape[0] < max(K, normals.shape[0])
         or ws.transposed.shape[0] < A.shape[0]
+        or ws.rate.R.shape[0] < R_rate.shape[0]
     ):
-        raise ValueError("the workspace does not fit the problem: make it with its horizon, rows and pairs")
+        raise ValueError(
+            "the workspace does not fit the problem: make it with its horizon, rows, pairs and weights"
+        )
     u, x, n_rows = ws.u, ws.x, 4 * N_INPUT * N + 2 * K
     transposed = ws.transposed[: A.shape[0]]
     _clear(ws.multipliers, n_rows)
     _clear(ws.state, n_rows)
-    riccati_pass(A, B, c, Q, R, Q_f, stationary, transposed, ws.K, ws.D, ws.A_cl, ws.P_c, ws.scratch)
+    _recursion(A, B, c, Q, R, Q_f, stationary, x_0, r, R_rate, u_last, ws)
     first_move = ws.first_move
     for a in range(N_INPUT):
         first_move[0, a] = min(u_last[a] - rate_step, upper[a])
@@ -396,13 +439,16 @@ def solve_structured(
     limit = step_limit(iteration_limit, N, K)
     status, iterations = NOT_FINITE, 0
     for attempt in range(3):
-        optimal_plan(
-            B, c, Q, Q_f, x_0, r, stationary, transposed, ws.K, ws.D, ws.A_cl, ws.P_c, u, x, ws.scratch
-        )
+        if R_rate.shape[0] > 0:
+            rate_plan(A.shape[0], Q.shape[0], ws.D, ws.rate, u, x)
+        else:
+            optimal_plan(
+                B, c, Q, Q_f, x_0, r, stationary, transposed, ws.K, ws.D, ws.A_cl, ws.P_c, u, x, ws.scratch
+            )
         if not (finite and _all_finite(u) and _all_finite(x)):
             return NOT_FINITE, iterations
         if attempt == 0 and worst_row(u, x, rows, ws.state)[0] < 0:
-            if is_mild(A, R, Q_f, N, ws.scratch[1]):
+            if R_rate.shape[0] == 0 and is_mild(A, R, Q_f, N, ws.scratch[1]):
                 return OPTIMAL, 0
             relative = lagrangian_gradient(
                 A,
@@ -413,6 +459,8 @@ def solve_structured(
                 Q_f,
                 x_0,
                 r,
+                R_rate,
+                u_last,
                 transposed,
                 rows,
                 u,
@@ -427,7 +475,7 @@ def solve_structured(
         # A warm start gets half of the steps, so that a cold one is left.
         steps = (iterations + limit + 1) // 2 if warm and attempt == 0 else limit
         status, iterations = _solve_rows(
-            A, B, c, Q, R, Q_f, stationary, x_0, r, rows, warm, iterations, steps, ws
+            A, B, c, Q, R, Q_f, stationary, x_0, r, R_rate, u_last, rows, warm, iterations, steps, ws
         )
         if status == OPTIMAL or iterations >= limit:
             break
@@ -467,9 +515,9 @@ class StructuredSolver:
         validate(qp)
         rows = qp.rows
         N, K = len(qp.c), len(rows.normal)
-        ws = self._fitting_workspace(N, K, len(qp.A))
+        ws = self._fitting_workspace(N, K, len(qp.A), qp.R_rate is not None)
         status, iterations = solve_structured(
-            *qp[:-3], float(qp.rate_step), qp.u_last, *rows, self.iteration_limit, False, ws
+            *qp[:-4], float(qp.rate_step), qp.u_last, *rows, rate_weight(qp), self.iteration_limit, False, ws
         )
         nv = N_INPUT * N
         edges = [nv, 2 * nv, 3 * nv, 4 * nv, 4 * nv + K]
@@ -478,15 +526,17 @@ class StructuredSolver:
         multipliers = Multipliers(*box_and_rate, *parts[4:])
         return Solution(Status(status), ws.u.copy(), ws.x.copy(), multipliers, iterations)
 
-    def _fitting_workspace(self, horizon: int, n_rows: int, n_models: int) -> Workspace:
+    def _fitting_workspace(self, horizon: int, n_rows: int, n_models: int, weighs_changes: bool) -> Workspace:
         """The kept workspace if the problem fits into it, else a larger one."""
         ws = self._workspace
-        if ws is None or len(ws.u) != horizon or len(ws.spans) < n_rows or len(ws.transposed) < n_models:
-            if ws is not None and len(ws.u) == horizon:
-                n_rows, n_models = max(n_rows, len(ws.spans)), max(n_models, len(ws.transposed))
-            ws = make_workspace(horizon, n_rows, n_models)
-            self._workspace = ws
-        return ws
+        if ws is not None and len(ws.u) == horizon:
+            fits = len(ws.spans) >= n_rows and len(ws.transposed) >= n_models
+            if fits and len(ws.rate.R) >= weighs_changes:
+                return ws
+            n_rows, n_models = max(n_rows, len(ws.spans)), max(n_models, len(ws.transposed))
+            weighs_changes = weighs_changes or len(ws.rate.R) > 0
+        self._workspace = make_workspace(horizon, n_rows, n_models, weighs_changes)
+        return self._workspace
 
     def __getstate__(self) -> dict[str, Any]:
         """The options alone: a workspace is scratch memory."""
