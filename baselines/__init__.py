@@ -13,9 +13,11 @@ if TYPE_CHECKING:
     from .errors import CheckpointError, PolicyCheckError, PolicyError, ResultsError, TrainingError
     from .estimate_wrapper import EstimateWrapper
     from .evaluation import Evaluation
+    from .export import export_policy
     from .metrics import Estimate, Record, estimate, measure, paired_difference
     from .policy import Policy, PolicyState, make_policy, policy_options
     from .rollout import Episode, run_episodes
+    from .sb3_policy import sb3
     from .single import evaluate
     from .suite import Suite
     from .suite_files import load_suite
@@ -42,6 +44,7 @@ _PUBLIC = {
     "check_policy": "conformance",
     "estimate": "metrics",
     "evaluate": "single",
+    "export_policy": "export",
     "load_policy": "trained",
     "load_suite": "suite_files",
     "make_policy": "policy",
@@ -50,6 +53,7 @@ _PUBLIC = {
     "policy_options": "policy",
     "run_benchmark": "benchmark",
     "run_episodes": "rollout",
+    "sb3": "sb3_policy",
     "shipped_policies": "trained",
     "train": "training.runs",
 }
@@ -73,6 +77,7 @@ __all__ = [
     "check_policy",
     "estimate",
     "evaluate",
+    "export_policy",
     "load_policy",
     "load_suite",
     "make_policy",
@@ -81,6 +86,7 @@ __all__ = [
     "policy_options",
     "run_benchmark",
     "run_episodes",
+    "sb3",
     "shipped_policies",
     "train",
 ]

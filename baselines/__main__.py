@@ -14,6 +14,7 @@ from .options import (
     CertifyOptions,
     DoctorOptions,
     EvaluateOptions,
+    ExportOptions,
     ListOptions,
     Parser,
     ReplayOptions,
@@ -62,6 +63,12 @@ def _train(options: TrainOptions) -> int:
     return train_command.train_one(options)
 
 
+def _export(options: ExportOptions) -> int:
+    from . import export_command
+
+    return export_command.export_one(options)
+
+
 def _reproduce(options: ReproduceOptions) -> int:
     from . import reproduce
 
@@ -97,6 +104,7 @@ COMMANDS: dict[str, Command] = {
     "evaluate": Command(EvaluateOptions, _evaluate),
     "benchmark": Command(BenchmarkOptions, _benchmark),
     "train": Command(TrainOptions, _train),
+    "export": Command(ExportOptions, _export),
     "reproduce": Command(ReproduceOptions, _reproduce),
     "report": Command(ReportOptions, _report),
     "replay": Command(ReplayOptions, _replay),

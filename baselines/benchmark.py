@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import replace
@@ -71,6 +72,10 @@ def run_benchmark(
 
 def _with_policies(suite: Suite, policies: Mapping[str, Any]) -> tuple[Suite, dict[str, Given]]:
     """A suite with more policies, and those of them that are objects by their labels."""
+    policies = {
+        label: os.fspath(policy) if isinstance(policy, os.PathLike) else policy
+        for label, policy in policies.items()
+    }
     choices = [
         PolicyChoice(policy if isinstance(policy, str) else name_of(policy), label=label)
         for label, policy in policies.items()

@@ -100,6 +100,22 @@ class TrainOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class ExportOptions:
+    """Make a checkpoint of a model of Stable-Baselines3: layers alone, which run no code."""
+
+    model: Annotated[
+        Path, Positional("zip that model.save of Stable-Baselines3 wrote: PPO, A2C, SAC, TD3, DDPG")
+    ]
+    folder: Annotated[Path, Positional("of the checkpoint")]
+    vecnormalize: Annotated[Path | None, "file of VecNormalize.save, if it was trained with it"] = None
+    env: Annotated[str, "environment it was trained in, so that what it sees is known by name"] = ""
+    set: Annotated[list[str], "keyword argument of the environment; JSON, {key: value}, or text"] = field(
+        default_factory=list
+    )
+    fresh: Annotated[bool, "replace the checkpoint that is in the folder"] = False
+
+
+@dataclass(frozen=True, slots=True)
 class ReproduceOptions:
     """Tables and claims of the dissertation beside our numbers."""
 

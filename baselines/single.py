@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,7 @@ def evaluate(
     """
     if out is None:
         return fly_and_measure(policy, env, episodes, seed, on_episode, mismatch=mismatch)
+    policy = os.fspath(policy) if isinstance(policy, os.PathLike) else policy
     choice = PolicyChoice(policy) if isinstance(policy, str) else _choice_of(policy)
     suite = Suite("evaluate", (_env_choice(env),), (choice,), episodes, seed)
     given = Given(

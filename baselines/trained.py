@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -112,7 +113,9 @@ def checkpoint_folder(source: str | os.PathLike[str]) -> Path:
     if path.is_file():
         raise CheckpointError(
             f"{text!r} is a file; a trained policy is a folder with network.safetensors and {_DESCRIPTION}. "
-            "Zips of Stable-Baselines3 and .pt files of torch are pickles, which are never opened"
+            "Zips of Stable-Baselines3 and .pt files of torch are pickles, which are never opened: quad-envs "
+            f"export {shlex.quote(text)} FOLDER makes a checkpoint of a zip, baselines.export_policy of a "
+            "torch module; a policy of your own in a .py file is named module:factory, as mypolicy:make"
         )
     if not path.is_dir():
         shipped = unknown_name("trained policy", text, shipped_policies())
