@@ -2,6 +2,7 @@
 # make test   install the development extras and run ruff, mypy and the tests
 # make slow   the tests that take longer: dissertation tables, other solvers, long flights
 # make docs   build the documentation into site/
+# make extras resolve every extra with the pins of constraints.txt, and install nothing
 # make rllib  install RLlib into .venv-rllib (it pins an older gymnasium) and train a formation on a local Ray
 # make test-rllib  conformance with that gymnasium, and the example, in that environment
 # make ray    fly the quick benchmark on joblib's Ray backend, in the same environment
@@ -12,7 +13,9 @@ BIN := $(VENV)/bin
 RLLIB_PIP := $(RLLIB)/bin/python -m pip --disable-pip-version-check -q install -c examples/constraints-rllib.txt
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 
-.PHONY: demo test slow docs rllib test-rllib ray clean
+EXTRAS := $(shell sed -n '/optional-dependencies/,/^\[project.scripts/s/^\([a-z]*\) = .*/\1/p' pyproject.toml)
+
+.PHONY: demo test slow docs extras rllib test-rllib ray clean
 
 demo: $(VENV)/installed
 	$(BIN)/quad-envs benchmark quick --fresh --out runs/demo
@@ -30,6 +33,9 @@ slow: $(VENV)/installed-dev
 docs: $(VENV)/installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
 	@echo "Open this page in a browser: $(CURDIR)/site/index.html"
+
+extras: $(VENV)/installed
+	for extra in $(EXTRAS); do echo "$$extra" && $(PIP) install --dry-run -c constraints.txt -e ".[$$extra]" || exit 1; done
 
 rllib: $(RLLIB)/installed
 	$(RLLIB)/bin/python -m examples.rllib_formation

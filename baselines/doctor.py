@@ -60,7 +60,7 @@ def _versions() -> Finding:
             found.append(f"{name} {metadata.version(name)}")
         except metadata.PackageNotFoundError:
             missing.append(name)
-    lacking = f"; missing: {', '.join(missing)}: pip install quad-envs again" if missing else ""
+    lacking = f"; missing: {', '.join(missing)}: pip install -e . in the clone again" if missing else ""
     return Finding("versions", not missing, ", ".join(found) + lacking)
 
 

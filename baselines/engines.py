@@ -8,11 +8,12 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, TypeVar
 
+from quad_envs.extras import install_command
 from quad_envs.names import unknown_name
 
 ENGINES = ("processes", "ray", "dask")
 _NEEDS = {
-    "ray": ("ray", 'pip install "quad-envs[ray]"'),
+    "ray": ("ray", install_command("ray")),
     "dask": ("distributed", 'pip install "dask[distributed]"'),
 }
 

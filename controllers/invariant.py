@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quad_envs.extras import install_command
 from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, Array
 from quad_envs.tasks import BaseTask
 
@@ -161,8 +162,8 @@ def _maximise_volume(A_K: Array, normals: Array) -> Array:
             cvxpy: Any = import_module("cvxpy")
     except ImportError as error:
         raise ModuleNotFoundError(
-            f"the largest invariant ellipsoid needs cvxpy and Clarabel ({error}): pip install "
-            '"quad-envs[lmi]"; the ellipsoid of the Riccati weight needs neither'
+            f"the largest invariant ellipsoid needs cvxpy and Clarabel ({error}): "
+            f"{install_command('lmi')}; the ellipsoid of the Riccati weight needs neither"
         ) from error
     n = len(A_K)
     Y = cvxpy.Variable((n, n), symmetric=True)

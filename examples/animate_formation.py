@@ -1,7 +1,7 @@
 """An animation of a flight: `python -m examples.animate_formation [--out formation.gif]`.
 
 Six quadrotors close a hexagon behind a leader that flies a slow helix, each deciding from what it hears. The
-frames are those of `render()`; Pillow writes them as one GIF (the picture in the project's README).
+frames are those of `render()`; Pillow writes them as one GIF (a picture of the documentation).
 """
 
 from __future__ import annotations

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .extras import install_command
+
 
 class Window:
     """Shows pictures at the pace of the flight.
@@ -24,7 +26,7 @@ class Window:
             import pygame
         except ImportError as error:
             raise ImportError(
-                'render_mode="human" needs pygame: pip install "quad-envs[human]", or use '
+                f'render_mode="human" needs pygame: {install_command("human")}, or use '
                 'render_mode="rgb_array"'
             ) from error
         self._pygame: Any = pygame

@@ -239,7 +239,7 @@ def test_without_the_packages_the_message_names_the_extra(monkeypatch):
         raise ImportError(f"No module named {name!r}")
 
     monkeypatch.setattr(importlib.import_module("controllers.invariant"), "import_module", missing)
-    with pytest.raises(ModuleNotFoundError, match=r"pip install \"quad-envs\[lmi\]\""):
+    with pytest.raises(ModuleNotFoundError, match=r"pip install .* -e \"\.\[lmi\]\""):
         largest_ellipsoid(HALF, BOX)
 
 

@@ -148,7 +148,7 @@ def test_what_cannot_be_certified_is_refused_in_one_line(capsys, arguments, mess
 def test_without_matplotlib_the_command_says_so_before_it_flies(capsys, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert main(["certify", REGULATION, "lmpc", "--out", str(tmp_path / "out")]) == 2
-    assert "quad-envs[report]" in capsys.readouterr().err and not (tmp_path / "out").exists()
+    assert '-e ".[report]"' in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import pytest
 
 from baselines.__main__ import main, make_parser
+from quad_envs.registration import TEAMS, TRACKING
 
 ROOT = pathlib.Path(__file__).parent.parent
 README = ROOT / "README.md"
@@ -139,3 +140,48 @@ def test_the_site_builds_strictly_and_loads_nothing_from_elsewhere(tmp_path):
         loaded += re.findall(r"<link[^>]*rel=[\"']?stylesheet[^>]*href=[\"']?(https?:[^\"'\s>]+)", text)
         assert not loaded, page
         assert 'class="arithmatex"' not in text, f"{page}: an equation was left as TeX"
+
+
+def script(name):
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_table_of_the_readme_has_the_numbers_of_the_results_page():
+    assert README.read_text(encoding="utf-8") == script("summary").renewed(), "run: python docs/summary.py"
+
+
+def test_the_readme_can_be_read_in_a_few_minutes():
+    # Results grew into it once: 200 lines of 16 words, a third of them digits.
+    lines = README.read_text(encoding="utf-8").splitlines()
+    full = [line.split() for line in lines if line.strip()]
+    assert len(lines) <= 130 and sum(map(len, full)) <= 12 * len(full)
+
+
+def test_the_gallery_shows_every_id():
+    page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+    assert [env_id for env_id in (*TRACKING, *TEAMS) if f"`{env_id}`" not in page] == []
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md"], ids=name_of)
+def test_every_link_and_picture_leads_to_a_file(page):
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    targets = [target.partition("#")[0] for target in re.findall(r"\]\(([^)\s]+)\)", text)]
+    missing = [t for t in targets if t and not t.startswith("http") and not (page.parent / t).exists()]
+    assert missing == []
+
+
+def test_every_file_that_the_map_of_the_chapters_names_is_there():
+    named = re.findall(r"`(\w+/[\w./]*)`", (ROOT / "docs" / "chapters.md").read_text(encoding="utf-8"))
+    assert len(named) > 30 and [name for name in named if not (ROOT / name).exists()] == []
+
+
+def test_every_extra_is_explained_in_the_readme():
+    project = (
+        (ROOT / "pyproject.toml").read_text(encoding="utf-8").split("[project.optional-dependencies]")[1]
+    )
+    extras = re.findall(r"^(\w+) = \[", project.split("[project.scripts]")[0], re.MULTILINE)
+    text = README.read_text(encoding="utf-8")
+    assert extras and [extra for extra in extras if f"`{extra}`" not in text] == []

@@ -15,6 +15,7 @@ EXAMPLES = {
     "supersuit_sb3": (["supersuit", "stable_baselines3"], ["--steps", "1536"], "consensus-mpc: score 0."),
     "torchrl_ppo": (["torchrl"], ["--updates", "1"], "update 1: mean reward 0."),
     "rllib_formation": (["ray.rllib"], ["--iterations", "1", "--batch", "1000"], "1000 steps, score 0."),
+    "gallery": ([], ["--only", "quad/Regulation-v0", "--out", "{tmp}"], "regulation.png, "),
     "animate_formation": ([], ["--steps", "8", "--out", "{tmp}/short.gif"], "3 frames in "),
     "your_own_filter": ([], [], "estimate_rmse"),
     "your_own_task": ([], ["--episodes", "1"], "sdc-nmpc on quad/HelixTracking-v0"),

@@ -334,7 +334,7 @@ def test_the_window_shows_every_moment_and_closes(screen):
 def test_a_missing_pygame_is_named_with_its_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
     env = formation_v0.parallel_env(render_mode="human")
-    with pytest.raises(ImportError, match=r"quad-envs\[human\]"):
+    with pytest.raises(ImportError, match=r"-e \"\.\[human\]\""):
         env.reset(seed=0)
 
 

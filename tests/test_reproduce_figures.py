@@ -73,7 +73,7 @@ def test_figures_without_a_folder_are_refused():
 
 def test_figures_without_matplotlib_name_the_extra(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(MissingPackageError, match=r"quad-envs\[report\]"):
+    with pytest.raises(MissingPackageError, match=r"-e \"\.\[report\]\""):
         sections(["figures-4"], out=tmp_path)
 
 

@@ -221,7 +221,7 @@ def test_an_algorithm_that_cannot_act_there_is_refused(tmp_path, env_id, algorit
 def test_a_missing_package_is_named_with_its_extra(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(ALGORITHMS, "stub", ALGORITHMS["stub"]._replace(packages=("no_such_torch",)))
     with pytest.raises(
-        MissingPackageError, match=r'no_such_torch, which is not installed: pip install "quad-envs\[rl\]"'
+        MissingPackageError, match=r'no_such_torch, which is not installed: pip install .* -e "\.\[rl\]"'
     ):
         run(tmp_path)
     assert main(["train", HELIX, "stub", "--out", str(tmp_path)]) == 2

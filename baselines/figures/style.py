@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_envs import canvas
+from quad_envs.extras import install_command
 
 from ..errors import MissingPackageError
 from ..results import write_atomic
@@ -97,7 +98,7 @@ def house_style() -> Iterator[None]:
         from cycler import cycler
     except ImportError as error:
         raise MissingPackageError(
-            f'figures need matplotlib ({error}): pip install "quad-envs[report]"'
+            f"figures need matplotlib ({error}): {install_command('report')}"
         ) from error
     style: Any = {**_STYLE, "axes.prop_cycle": cycler(color=[COLOURS[name] for name in CYCLE])}
     with matplotlib.rc_context(style):

@@ -16,6 +16,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, NamedTuple
 
+from quad_envs.extras import install_command
 from quad_envs.names import unknown_name
 
 from ..errors import MissingPackageError
@@ -124,7 +125,7 @@ def require_packages(name: str) -> None:
         verb = "is" if len(missing) == 1 else "are"
         raise MissingPackageError(
             f"training with {name!r} needs {' and '.join(missing)}, which {verb} not installed: "
-            'pip install "quad-envs[rl]". Trained policies fly without.'
+            f"{install_command('rl')}. Trained policies fly without."
         )
 
 

@@ -59,7 +59,7 @@ class FormationEnv(TeamEnv):
     Task: `reference` of the leader ("line", "setpoint", "fast-line", "slow-helix", any of the suite's),
         `preview` 5 stages of it, `formation_weight` w 1, `time_limit` 20 s or `max_cycles` steps.
 
-    Rendering: `render_mode` None, "rgb_array" or "human" (a window, needs `quad-envs[human]`), `render_size`
+    Rendering: `render_mode` None, "rgb_array" or "human" (a window, needs the extra `human`), `render_size`
         (640, 480) pixels.
 
     ## References
