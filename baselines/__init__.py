@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from .estimate_wrapper import EstimateWrapper
     from .evaluation import Evaluation
     from .export import export_policy
+    from .figures.episodes import plot_episode
     from .metrics import Estimate, Record, estimate, measure, paired_difference
     from .policy import Policy, PolicyState, make_policy, policy_options
     from .rollout import Episode, run_episodes
@@ -50,6 +51,7 @@ _PUBLIC = {
     "make_policy": "policy",
     "measure": "metrics",
     "paired_difference": "metrics",
+    "plot_episode": "figures.episodes",
     "policy_options": "policy",
     "run_benchmark": "benchmark",
     "run_episodes": "rollout",
@@ -83,6 +85,7 @@ __all__ = [
     "make_policy",
     "measure",
     "paired_difference",
+    "plot_episode",
     "policy_options",
     "run_benchmark",
     "run_episodes",

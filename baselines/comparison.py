@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from .evaluation import NO_SPANNING_TREE, Evaluation
 from .metrics import paired_difference, said_causes, totals, worst_violations
 from .results import plain_json
 from .suite import EnvChoice, Suite
-from .table import format_number, format_table
+from .table import Table, format_number
 from .units import Unit, suite_units
 
 COMPARED = ("score", "cost", "position_rms", "effort")  # columns with paired differences
@@ -55,6 +56,9 @@ class Failure(NamedTuple):
     env: str  # title
     policy: str  # title
     message: str  # names the policy and the line of its file
+
+    def __str__(self) -> str:
+        return f"{self.policy} did not fly in {self.env}: {self.message}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,14 +145,22 @@ class Results:
         return found
 
     def __str__(self) -> str:
-        failures = [f"{one.policy} did not fly in {one.env}: {one.message}" for one in self.failures]
+        return "\n\n".join([*map(str, self._tables()), *map(str, self.failures)])
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        failures = (f"<div>{html.escape(str(one))}</div>" for one in self.failures)
+        return "".join([*(table.html() for table in self._tables()), *failures])
+
+    def _tables(self) -> list[Table]:
+        """One per environment."""
         if self.suite.learned:
-            return "\n\n".join([contender_tables(self.contender_rows()), *failures])
+            return contender_tables(self.contender_rows())
         flown = dict.fromkeys(unit.env.title for unit in self.flown())
         envs = [one for env in self.suite.envs for one in self.suite.flown(env).values()]
-        return "\n\n".join([*(self._table(env) for env in envs if env.title in flown), *failures])
+        return [self._table(env) for env in envs if env.title in flown]
 
-    def _table(self, env: EnvChoice) -> str:
+    def _table(self, env: EnvChoice) -> Table:
         rows = [row for row in self.summary() if row["env"] == env.title]
         limits = [key for key in rows[0] if key.startswith("worst_")]  # differ in unit, so never merged
         before, after, team = list(_COLUMNS), list(_LAST_COLUMNS), "vehicles" in rows[0]
@@ -174,8 +186,8 @@ class Results:
             lines.append([name, *first, str(row["crashed"]), *last, *counts])
         header = ["policy", *titles[0], "crashes", *titles[1], "fallbacks", "left model"]
         seeds = f"seeds {self.suite.seed} to {self.suite.seed + self.suite.episodes - 1}"
-        note = "" if rows[0].get("spanning_tree", True) else f"\nnote: {NO_SPANNING_TREE}"
-        return f"{env.title}, {seeds}{note}\n{format_table(header, lines)}"
+        notes = () if rows[0].get("spanning_tree", True) else (f"note: {NO_SPANNING_TREE}",)
+        return Table((f"{env.title}, {seeds}", *notes), header, lines)
 
 
 def _timed(what: str, quantiles: tuple[float, float, float]) -> dict[str, float]:

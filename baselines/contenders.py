@@ -18,7 +18,7 @@ from .evaluation import Evaluation
 from .metrics import summarize, totals, worst_violations
 from .statistics import Comparison, Interval, compare
 from .suite import PolicyChoice, Suite, is_for
-from .table import format_number, format_table
+from .table import Table, format_number
 from .team_metrics import flight_values
 from .training.algorithms import ALGORITHMS
 from .units import Unit, training_units
@@ -193,13 +193,13 @@ _LAST_COLUMNS = (
 )
 
 
-def contender_tables(rows: Sequence[Mapping[str, Any]]) -> str:
+def contender_tables(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
     """One table per environment and condition; [low, high] are 95 % bootstrap intervals."""
     keys = dict.fromkeys((row["env"], row["condition"]) for row in rows)
-    return "\n\n".join(_table([row for row in rows if (row["env"], row["condition"]) == key]) for key in keys)
+    return [_table([row for row in rows if (row["env"], row["condition"]) == key]) for key in keys]
 
 
-def _table(rows: Sequence[Mapping[str, Any]]) -> str:
+def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
     limits = [(key.replace("_", " "), key, 1.0) for key in rows[0] if key.startswith("worst_")]
     first, last = (
         [entry for entry in part if any(entry[1] in row for row in rows)]
@@ -218,7 +218,7 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> str:
         for row in rows
     ]
     title = ", ".join(filter(None, (rows[0]["env"], rows[0]["condition"])))
-    return f"{title}\n{format_table(header, lines)}"
+    return Table((title,), header, lines)
 
 
 def _cell(row: Mapping[str, Any], key: str, factor: float) -> str:

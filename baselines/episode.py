@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +15,8 @@ from quad_envs.constraints import forces_from_actions
 from quad_envs.parameters import Array
 from quad_envs.tasks import BaseTask, TeamTask
 
+from .episode_columns import as_csv, episode_columns
+from .errors import MissingPackageError
 from .policy import N_FALLBACKS, Actions, Counts, PolicyState
 from .team_signals import TEAM_INFO, WRAPPER_INFO, estimate_signals
 
@@ -54,6 +59,31 @@ class Episode(NamedTuple):
     left_model: int = 0  # decisions whose state or plan left where the policy's model holds
     team_size: int = 1  # vehicles that were decided for at once: the team took team_size * decision_times
     signals: Mapping[str, NDArray[Any]] = {}
+
+    def columns(self) -> dict[str, Array]:
+        """Name -> (T+1,), the flight as a table: a row is a control period; see `episode_columns`."""
+        return episode_columns(self)
+
+    def to_csv(self, path: str | os.PathLike[str] | None = None) -> str:
+        """The columns as text, written to a file if there is a path; what is not a number stays empty."""
+        text = as_csv(self.columns())
+        if path is not None:
+            Path(path).write_text(text, encoding="utf-8")
+        return text
+
+    def to_frame(self) -> Any:
+        """The columns as a pandas `DataFrame`.
+
+        Raises:
+            MissingPackageError: If pandas, which this suite does not need otherwise, is not installed.
+        """
+        try:
+            pandas = import_module("pandas")
+        except ImportError as error:
+            raise MissingPackageError(
+                f"to_frame needs pandas ({error}): pip install pandas; columns() gives the same without"
+            ) from error
+        return pandas.DataFrame(self.columns())
 
 
 class Said(NamedTuple):

@@ -29,7 +29,7 @@ from .outside import is_policy
 from .policy import Policy, make_policy, policy_name
 from .results import plain_json
 from .rollout import Episode, is_privileged, run_episodes
-from .table import format_number, format_table
+from .table import Table, format_number
 from .team_metrics import TEAM_COLUMNS, TEAM_CUT_SHORT, by_flight, flight_values, has_team
 
 _UNITS = {
@@ -136,6 +136,13 @@ class Evaluation:
         return cls(**{**plain, **times, "records": tuple(records)})
 
     def __str__(self) -> str:
+        return str(self._table())
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        return self._table().html()
+
+    def _table(self) -> Table:
         rows = []
         for name, value in self.summary().items():
             found = flight_values(self.records, name)
@@ -146,16 +153,12 @@ class Evaluation:
             cells = [value.mean, value.half_width, *spread]
             unit = _UNITS[name.removesuffix("_worst")]
             rows.append([name, unit, *map(format_number, cells), str(value.n)])
-        table = format_table(["metric", "unit", "mean", "+- 95 %", "min", "max", "flights"], rows)
         counts = totals(self.records).items()
         counted = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counts)
         of_team = f" of {self.vehicles} vehicles" if has_team(self.records) else ""
-        lines = [
-            f"{self.title} on {self.env_id}, {self.flights} flights{of_team} from seed {self.seed}",
-            *(f"note: {note}" for note in self.notes),
-            table,
-            f"decisions: {_times(self.decision_ms)}" + (" per vehicle" if of_team else ""),
-        ]
+        title = f"{self.title} on {self.env_id}, {self.flights} flights{of_team} from seed {self.seed}"
+        notes = (f"note: {note}" for note in self.notes)
+        lines = [f"decisions: {_times(self.decision_ms)}" + (" per vehicle" if of_team else "")]
         if of_team:
             lines.append(f"decisions of the whole team: {_times(self.team_ms)}")
         lines.append(f"counts: {counted}")
@@ -164,7 +167,8 @@ class Evaluation:
             lines.append(f"crashes by: {said_causes(self.records)}")
         if worst:
             lines.append("worst violation: " + ", ".join(f"{k} {format_number(v)}" for k, v in worst.items()))
-        return "\n".join(lines)
+        header = ["metric", "unit", "mean", "+- 95 %", "min", "max", "flights"]
+        return Table((title, *notes), header, rows, tuple(lines))
 
     def _tells(self, name: str, values: Iterable[float]) -> bool:
         """Whether a column has anything to say: a number, or that a crash left none."""

@@ -1,9 +1,11 @@
-"""Plain text tables."""
+"""Tables as plain text and, for notebooks, as HTML."""
 
 from __future__ import annotations
 
+import html
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 
 def format_number(value: float, digits: int = 4) -> str:
@@ -28,3 +30,35 @@ def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
     rule = "  ".join("-" * width for width in widths)
     return "\n".join([line(header), rule, *map(line, rows)])
+
+
+class Table(NamedTuple):
+    """A table with what is said above and below it."""
+
+    before: tuple[str, ...]  # lines; the first is the title
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    after: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return "\n".join([*self.before, format_table(self.header, self.rows), *self.after])
+
+    def html(self) -> str:
+        """The same for a notebook, which brings its own style."""
+
+        def cells(kind: str, row: Sequence[str]) -> str:
+            aligned = (f' style="text-align: {"left" if i == 0 else "right"}"' for i in range(len(row)))
+            return "".join(
+                f"<{kind}{style}>{html.escape(cell)}</{kind}>"
+                for style, cell in zip(aligned, row, strict=True)
+            )
+
+        body = "".join(f"<tr>{cells('td', row)}</tr>" for row in self.rows)
+        above, below = (
+            "".join(f"<div>{html.escape(line)}</div>" for line in lines)
+            for lines in (self.before[1:], self.after)
+        )
+        return (
+            f"<div><strong>{html.escape(self.before[0])}</strong></div>{above}"
+            f"<table><thead><tr>{cells('th', self.header)}</tr></thead><tbody>{body}</tbody></table>{below}"
+        )
