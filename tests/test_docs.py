@@ -22,7 +22,12 @@ from quad_envs.registration import TEAMS, TRACKING
 ROOT = pathlib.Path(__file__).parent.parent
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
-QUICK = ("docs/extending.md", "docs/maths/qp.md", "docs/maths/sdc.md")  # run by default, the others are slow
+QUICK = (
+    "docs/extending.md",
+    "docs/maths/qp.md",
+    "docs/maths/sdc.md",
+    "docs/tutorial/method.md",
+)  # run by default, the others are slow
 LANGUAGES = ("python", "bash", "toml", "csv", "text", "")  # "": text
 _FENCE = re.compile(r"^```(\w*)(?: title=\"([^\"]+)\")?\s*$")
 _MARK = re.compile(r"<!-- not run: .+ -->")
