@@ -16,6 +16,7 @@ from quad_envs.parameters import Array
 
 from .evaluation import Evaluation
 from .metrics import summarize, totals, worst_violations
+from .policy import from_outside
 from .statistics import Comparison, Interval, compare
 from .suite import PolicyChoice, Suite, is_for
 from .table import Table, format_number
@@ -33,7 +34,7 @@ class Contender(NamedTuple):
     env: str
     condition: str
     name: str
-    kind: str  # "controller", "model-free", "imitation" or "model-based"
+    kind: str  # "controller", "model-free", "imitation" or "model-based"; "outside" if it is none of ours
     evaluations: tuple[Evaluation, ...]  # one per training seed
     trainings: tuple[Mapping[str, Any], ...]  # of its networks, if it was trained here
 
@@ -111,8 +112,9 @@ def find_contenders(
 
 
 def _kind(policy: PolicyChoice) -> str:
-    learned = policy.train is not None or policy.shipped
-    return ALGORITHMS[policy.name].kind if learned else "controller"
+    if policy.train is not None or policy.shipped:
+        return ALGORITHMS[policy.name].kind
+    return "outside" if ":" in policy.name or from_outside(policy.name) else "controller"
 
 
 def contender_rows(contenders: Sequence[Contender], base: str) -> list[dict[str, Any]]:

@@ -11,8 +11,8 @@ from gymnasium.envs.registration import EnvSpec
 from .episode_limit import SuiteSpec
 from .names import shown
 
-_ENTRY = "quad_envs.envs.tracking:TrackingEnv"
-_VECTOR_ENTRY = "quad_envs.envs.tracking_vector:TrackingVectorEnv"
+ENTRY = "quad_envs.envs.tracking:TrackingEnv"
+VECTOR_ENTRY = "quad_envs.envs.tracking_vector:TrackingVectorEnv"
 
 TIME_LIMIT, DT = 10.0, 0.05  # s, length of an episode and control period, where nothing else is said
 # Defaults of each tracking id; any keyword argument of TrackingEnv overrides them in `gymnasium.make`.
@@ -64,8 +64,8 @@ def tracking_spec(env_id: str, defaults: dict[str, Any]) -> SuiteSpec:
     steps = round(defaults.get("time_limit", TIME_LIMIT) / defaults.get("dt", DT))
     return SuiteSpec(
         env_id,
-        entry_point=_ENTRY,
-        vector_entry_point=_VECTOR_ENTRY,
+        entry_point=ENTRY,
+        vector_entry_point=VECTOR_ENTRY,
         max_episode_steps=steps,
         reward_threshold=round(NMPC_SCORES[env_id] * steps, 6),
         kwargs={"env_id": env_id, **defaults},

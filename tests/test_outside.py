@@ -22,7 +22,9 @@ from baselines import (
     run_episodes,
 )
 from baselines.__main__ import main
+from baselines.environments import make_env
 from baselines.outside import installed_policies, name_of, names_factory
+from baselines.training.held_out import HeldOutFlights, training_options
 from quad_envs import formation_v0
 
 HELIX = "quad/HelixTracking-v0"
@@ -94,6 +96,7 @@ import gymnasium
 gymnasium.register(
     "lab/Eight-v0",
     entry_point="quad_envs.envs.tracking:TrackingEnv",
+    vector_entry_point="quad_envs.envs.tracking_vector:TrackingVectorEnv",
     kwargs={"env_id": "lab/Eight-v0", "reference": "lemniscate", "time_limit": 2.0},
 )
 """
@@ -360,6 +363,24 @@ def test_an_environment_is_named_by_module_and_id(folder, capsys):
     ):
         assert main(["evaluate", wrong, "lqr"]) == 2
         assert said in capsys.readouterr().err
+
+
+def test_the_options_of_an_environment_named_by_module_and_id_are_those_it_is_registered_with(theirs):
+    options = training_options("their_env:lab/Eight-v0", {"kappa": 0.4})
+    task = make_env("their_env:lab/Eight-v0", kappa=0.4).unwrapped.task
+    assert options.task == task and task.env_id == "lab/Eight-v0"
+    flights = HeldOutFlights("their_env:lab/Eight-v0", {"kappa": 0.4})
+    assert flights.task == task
+    gym.register("lab/Other-v0", entry_point="quad_envs.envs.tracking:TrackingEnv")
+    try:
+        with pytest.raises(
+            ValueError, match="cannot be trained in: it must be registered with the entry_point"
+        ):
+            training_options("their_env:lab/Other-v0", {})
+    finally:
+        gym.registry.pop("lab/Other-v0")
+    with pytest.raises(ValueError, match="unknown environment id 'their_env:lab/Ate-v0'"):
+        training_options("their_env:lab/Ate-v0", {})
 
 
 def test_installed_packages_offer_policies_by_entry_points(theirs, monkeypatch, capsys):

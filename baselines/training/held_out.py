@@ -15,9 +15,10 @@ import gymnasium
 import numpy as np
 
 from quad_envs.names import unknown_name
-from quad_envs.registration import TEAMS, TRACKING
+from quad_envs.registration import ENTRY, TEAMS, TRACKING, VECTOR_ENTRY
 
 from ..evaluation import fly_and_measure
+from ..outside import import_named
 from .networks import Network, NetworkPolicy
 
 HELD_OUT = 10_000  # the first environment seed that training must not use
@@ -75,9 +76,30 @@ def training_options(env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
 
         if name in TRACKING:
             return TrackingOptions.from_kwargs({"env_id": name, **TRACKING[name], **env_kwargs})
+        if ":" in name:
+            return TrackingOptions.from_kwargs({**_registered(name), **env_kwargs})
     except TypeError as error:
         raise ValueError(str(error)) from error
     raise ValueError(unknown_name("environment id", env_id, [*TRACKING, *TEAMS]))
+
+
+def _registered(env_id: str) -> dict[str, Any]:
+    """Arguments with which a module of the user's registers a task of this suite, by `module:id`.
+
+    Raises:
+        ValueError: If it registers no such id, or another kind of environment.
+    """
+    module, _, name = env_id.rpartition(":")
+    import_named(module, f"environment {env_id!r}")
+    if name not in gymnasium.registry:
+        raise ValueError(unknown_name("environment id", env_id, [*TRACKING, *TEAMS]))
+    spec = gymnasium.registry[name]
+    if (spec.entry_point, spec.vector_entry_point) != (ENTRY, VECTOR_ENTRY):
+        raise ValueError(
+            f"{env_id!r} cannot be trained in: it must be registered with the entry_point {ENTRY!r} and the "
+            f"vector_entry_point {VECTOR_ENTRY!r}"
+        )
+    return {"env_id": name, **spec.kwargs}
 
 
 class HeldOutFlights:
