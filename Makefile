@@ -17,8 +17,10 @@ EXTRAS := $(shell sed -n '/optional-dependencies/,/^\[project.scripts/s/^\([a-z]
 
 .PHONY: demo test slow docs extras rllib test-rllib ray clean
 
-demo: $(VENV)/installed
-	$(BIN)/quad-envs benchmark quick --fresh --out runs/demo
+demo:
+	@test -e $(VENV)/installed || echo "install: into $(VENV), one to three minutes; then compile, about one, and fly"
+	@$(MAKE) --no-print-directory PIP="$(BIN)/python -m pip --disable-pip-version-check" $(VENV)/installed
+	@$(BIN)/quad-envs benchmark quick --fresh --out runs/demo
 	@echo "Open this page in a browser: $(CURDIR)/runs/demo/report.html"
 
 test: $(VENV)/installed-dev

@@ -186,10 +186,11 @@ def evaluate_one(options: EvaluateOptions) -> int:
 
 def benchmark_suite(options: BenchmarkOptions) -> int:
     """Fly a suite, print its tables, and leave a results folder."""
-    from .benchmark import run_benchmark
+    from .benchmark import fly_suite
+    from .stages import SweepProgress
     from .suite import PolicyChoice
     from .suite_files import load_suite
-    from .units import suite_units, training_units
+    from .sweep import Order
 
     suite = load_suite(options.suite)
     changes = {
@@ -198,29 +199,29 @@ def benchmark_suite(options: BenchmarkOptions) -> int:
     suite = replace(suite.quick() if options.quick else suite, **changes)
     suite = replace(suite, policies=(*suite.policies, *map(PolicyChoice, options.policy)))
     out = options.out or Path("runs") / f"{suite.name}-{datetime.now():%Y%m%d-%H%M%S}"
-    finished = 0
-    with progress(len(training_units(suite)) + len(suite_units(suite)), "unit") as bar, plain_warnings():
+    finished, watcher = 0, SweepProgress()
 
-        def on_unit(count: int, total: int) -> None:
-            nonlocal finished
-            finished = count
-            bar.update(count - bar.n)
+    def on_unit(count: int, total: int) -> None:
+        nonlocal finished
+        finished = count
 
+    order = Order(
+        options.engine,
+        options.jobs,
+        options.save_episodes,
+        options.fresh,
+        options.networks,
+        on_unit,
+        watcher,
+    )
+    with plain_warnings():
         try:
-            results = run_benchmark(
-                suite,
-                out,
-                engine=options.engine,
-                jobs=options.jobs,
-                save_episodes=options.save_episodes,
-                fresh=options.fresh,
-                networks=options.networks,
-                on_unit=on_unit,
-            )
+            results = fly_suite(suite, {}, out, order)
         except KeyboardInterrupt:
-            bar.close()
             say(f"interrupted; {finished} units are stored. Resume with: {_resume(options, out)}")
             return 130
+        finally:
+            watcher.close()
     print(json.dumps(results.to_dict(), indent=1, allow_nan=False) if options.json else results)
     _say_where(out)
     return _FAILED if results.failures else 0

@@ -101,6 +101,7 @@ class PolicyEntry(NamedTuple):
     factory: str  # name in the module: called with the task and the options
     description: str
     missions: tuple[str, ...] = ("tracking",)  # that it serves, see `mission_of`
+    decision_ms: float = 0.05  # about, of a vehicle: sweeps fly the quick ones first, and estimate their time
     privileged: bool = False  # it sees `env.state()`: a yardstick, listed apart
 
 
@@ -109,16 +110,29 @@ TEAM_MISSIONS = (_FORMATION, _TARGET, _ESTIMATION)
 
 # Names that `make_policy` knows for tracking tasks.
 TRACKING_POLICIES: dict[str, PolicyEntry] = {
-    "lmpc": PolicyEntry("controllers", "LinearMPC", "linear MPC on the hover model (chapter 3)"),
-    "sdc-nmpc": PolicyEntry("controllers", "SdcNmpc", "MPC on the state-dependent model (chapter 4)"),
-    "nmpc": PolicyEntry("controllers", "ExactNmpc", "MPC on the exact model: real-time iteration, or SQP"),
-    "sdre": PolicyEntry("controllers", "Sdre", "state-dependent Riccati feedback, without preview"),
-    "lqr": PolicyEntry("controllers", "Lqr", "constant feedback of the hover model, without preview"),
-    "feedback-linearization": PolicyEntry(
-        "controllers", "FeedbackLinearization", "feedback linearization with an attitude loop"
+    "lmpc": PolicyEntry(
+        "controllers", "LinearMPC", "linear MPC on the hover model (chapter 3)", decision_ms=0.06
     ),
-    "hover": PolicyEntry("baselines.tracking", "Hover", "hover thrust, whatever happens"),
-    "random": PolicyEntry("baselines.tracking", "Random", "uniform random actions"),
+    "sdc-nmpc": PolicyEntry(
+        "controllers", "SdcNmpc", "MPC on the state-dependent model (chapter 4)", decision_ms=0.13
+    ),
+    "nmpc": PolicyEntry(
+        "controllers", "ExactNmpc", "MPC on the exact model: real-time iteration, or SQP", decision_ms=0.2
+    ),
+    "sdre": PolicyEntry(
+        "controllers", "Sdre", "state-dependent Riccati feedback, without preview", decision_ms=0.08
+    ),
+    "lqr": PolicyEntry(
+        "controllers", "Lqr", "constant feedback of the hover model, without preview", decision_ms=0.01
+    ),
+    "feedback-linearization": PolicyEntry(
+        "controllers",
+        "FeedbackLinearization",
+        "feedback linearization with an attitude loop",
+        decision_ms=0.01,
+    ),
+    "hover": PolicyEntry("baselines.tracking", "Hover", "hover thrust, whatever happens", decision_ms=0.0),
+    "random": PolicyEntry("baselines.tracking", "Random", "uniform random actions", decision_ms=0.0),
 }
 
 # And for teams; "hover" and "random" serve both.
@@ -152,12 +166,19 @@ TEAM_POLICIES: dict[str, PolicyEntry] = {
         "CentralMpcPolicy",
         "one MPC over the whole team, from the whole truth (8.2.3)",
         (_FORMATION, _TARGET),
+        decision_ms=0.5,
         privileged=True,
     ),
     "hover": PolicyEntry(
-        "baselines.team_policies", "TeamHover", "hover thrust, whatever happens", TEAM_MISSIONS
+        "baselines.team_policies",
+        "TeamHover",
+        "hover thrust, whatever happens",
+        TEAM_MISSIONS,
+        decision_ms=0.0,
     ),
-    "random": PolicyEntry("baselines.team_policies", "TeamRandom", "uniform random actions", TEAM_MISSIONS),
+    "random": PolicyEntry(
+        "baselines.team_policies", "TeamRandom", "uniform random actions", TEAM_MISSIONS, decision_ms=0.0
+    ),
 }
 
 

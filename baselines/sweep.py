@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from .comparison import Failure, Results
 from .engines import run_units
@@ -26,12 +26,23 @@ from .results import (
     write_csv,
     write_json,
 )
+from .stages import price
 from .suite import Suite
 from .training.finished import train_unit
 from .unit_flights import fly_unit
 from .units import Given, Unit, suite_units, training_units
 
 REPORTED = 2  # flights of each unit that are saved for the report where not all are asked for
+
+
+class Watcher(Protocol):
+    """Who follows a sweep."""
+
+    def ready(self, left: Sequence[Unit]) -> None:
+        """All is checked, and networks are trained: these units are going to fly."""
+
+    def flown(self, unit: Unit, found: Evaluation) -> None:
+        """A unit was flown just now, or came from another process."""
 
 
 class Order(NamedTuple):
@@ -43,6 +54,7 @@ class Order(NamedTuple):
     fresh: bool = False
     networks: str | Path | None = None
     on_unit: Callable[[int, int], None] | None = None
+    watcher: Watcher | None = None
 
 
 def with_given(units: Sequence[Unit], given: Mapping[str, Given]) -> list[Unit]:
@@ -85,6 +97,11 @@ class Sweep:
         for number, training in run_units(train_unit, self.to_train, engine, jobs):
             self.trained[number] = training
             report(self.done, total)
+        if jobs == 1:  # in parallel the long ones would be left over in the end
+            places = {unit.env.title: i for i, unit in reversed(list(enumerate(left)))}
+            left.sort(key=lambda unit: (places[unit.env.title], price(unit)))
+        if self.order.watcher is not None:
+            self.order.watcher.ready(left)
         for number, cell in run_units(fly_unit, left, engine, jobs):
             if "failure" in cell:
                 self.failed[number] = cell["failure"]
@@ -94,6 +111,8 @@ class Sweep:
                     write_json(self.folder / "cells" / self.units[number].file_name, cell)
                 self.flown[number] = cell
             report(self.done, total)
+            if self.order.watcher is not None and number in self.flown:
+                self.order.watcher.flown(self.units[number], Evaluation.from_plain(cell["found"]))
 
     def _warn(self, number: int) -> None:
         """Say at once, and not only in the end, that one of several units broke off."""

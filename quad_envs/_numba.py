@@ -18,7 +18,7 @@ import numpy as np
 from numba.core import config, event
 
 try:
-    from ._kernel_cache import PACKAGES, KernelCache
+    from ._kernel_cache import PACKAGES, KernelCache, folder
     from ._nested import NestedKernel
 except (ImportError, AttributeError) as error:  # a test hides the names in a process of its own
     warnings.warn(
@@ -61,6 +61,14 @@ def entry_of(compiled: Function) -> Function:
     return cast(Function, getattr(compiled, "entry", compiled))
 
 
+def _kept() -> str:
+    """What one compiles and how long it is good for, as the first call finds it."""
+    what = "for the first use of this environment or policy, 5 to 20 s each"
+    if KernelCache is None or folder() is None:
+        return f"{what}; nothing can be kept, so that each process compiles anew"
+    return f"{what}; kept until their code changes"
+
+
 class _Announcer(event.Listener):
     """Says once per process that kernels are being compiled, since the first call then takes seconds."""
 
@@ -72,8 +80,7 @@ class _Announcer(event.Listener):
         module = event.data["dispatcher"].py_func.__module__ or ""
         if not self.said and module.split(".")[0] in PACKAGES:
             self.said = True
-            message = "quad_envs: compiling kernels, once per installation (up to half a minute) ..."
-            print(message, file=sys.stderr, flush=True)
+            print(f"quad_envs: compiling {_kept()}", file=sys.stderr, flush=True)
 
     def on_end(self, event: Any) -> None:
         """Nothing to say when it ends."""
