@@ -59,7 +59,14 @@ def decide(
     seconds = perf_counter() - begin
     if not isinstance(answer, tuple) or len(answer) != 2:
         raise _broken(policy, recorder, f"predict must return (actions, state), got {_kind(answer)}")
-    actions = np.asarray(answer[0])
+    try:
+        actions = np.asarray(answer[0])
+    except (
+        TypeError,
+        ValueError,
+        RuntimeError,
+    ) as error:  # ragged lists; tensors with a gradient or on a GPU
+        raise _broken(policy, recorder, f"actions must be an array: {told(error)}") from error
     wanted = _shape(policy, observations, recorder)
     if actions.shape != wanted or actions.dtype.kind not in "fiu":
         seen = f"for observations of shape {np.shape(observations)}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
@@ -17,7 +18,7 @@ from .environments import make_env
 from .episode import Episode
 from .errors import ResultsError
 from .evaluation import fly_and_measure
-from .policy import from_outside, make_policy
+from .policy import from_outside, make_policy, policy_name
 from .report.folder import task_facts
 from .results import write_atomic
 from .units import Unit
@@ -56,6 +57,8 @@ def _fly(unit: Unit) -> dict[str, Any]:
     found = fly_and_measure(
         policy, env, unit.episodes, unit.seed, on_episode=on_episode, mismatch=unit.given.mismatch
     )
+    if unit.given.policy is None:
+        found = replace(found, policy=policy_name(policy, unit.policy_name))
     if unit.given.env is None:
         env.close()
     seconds = perf_counter() - begin

@@ -82,6 +82,11 @@ class Bare(Even):
         return np.zeros((1, 4), np.float32)
 
 
+class Ragged(Even):
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return [[0.0], [0.0, 0.0]], state
+
+
 class Narrow(Even):
     def predict(self, observation):
         return np.zeros((1, 4), np.float32), None
@@ -221,6 +226,7 @@ def test_the_line_is_where_it_happened(theirs):
             r"actions must have shape \(1, 4\) for .* \(1, 226\), got ndarray of shape \(4,\).*, line \d+$",
         ),
         ("Bare", r"must return \(actions, state\), got ndarray of shape \(1, 4\)"),
+        ("Ragged", r"actions must be an array: ValueError: .*, line \d+$"),
         ("Narrow", "TypeError: .*unexpected keyword argument 'deterministic'"),
     ],
 )
@@ -343,10 +349,11 @@ def test_evaluate_leaves_flights_tables_and_a_page(theirs, folder):
     assert len(list((folder / "out/episodes").glob("*.npz"))) == 2
 
 
-def test_evaluate_leaves_a_folder_of_teams_and_of_names_too(folder):
+def test_evaluate_leaves_a_folder_of_teams_and_of_names_too(theirs, folder):
     team = formation_v0.parallel_env(vehicles=3, time_limit=1.0)
     assert evaluate("hover", team, episodes=1, out=folder / "team").vehicles == 3
     assert evaluate("hover", HELIX, episodes=1, out=folder / "name").policy == "hover"
+    assert evaluate("their_policy:make", HELIX, 1, out=folder / "theirs").policy == "their_policy:make"
     for name in ("team", "name"):
         assert (folder / name / "report.html").exists()
     vector = formation_v0.vector_env(num_teams=2)
