@@ -25,11 +25,12 @@ from .options import (
     read_options,
     refuse_unknown,
 )
+from .streams import quiet_pipe, take_streams
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-_INTERRUPTED, _BROKEN_PIPE = 130, 141  # as the shell names the signals
+_INTERRUPTED = 130  # as the shell names the signal
 
 
 class Command(NamedTuple):
@@ -132,18 +133,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Modules of the current folder can be named, as `mypolicy:make`.
     """
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    parser = make_parser()
-    if given and not given[0].startswith("-") and given[0] not in COMMANDS:
-        from quad_envs.names import unknown_name
-
-        parser.error(unknown_name("command", given[0], COMMANDS))
-    found, rest = parser.parse_known_args(given)
-    command = COMMANDS[found.command]
-    refuse_unknown(rest, command.options, parser)
-    with _quiet_pipe(), _importable_here():
+    if not take_streams():
+        print("quad-envs: error: standard output is closed; > /dev/null prints nowhere", file=sys.stderr)
+        return 2
+    with quiet_pipe(), _importable_here():
         try:
-            return command.run(read_options(command.options, found))
+            return _run(list(sys.argv[1:] if arguments is None else arguments))
         except BrokenPipeError:
             raise
         except Exception as error:
@@ -156,35 +151,41 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _INTERRUPTED
 
 
+def _run(given: list[str]) -> int:
+    """Run the command of some arguments."""
+    parser = make_parser()
+    if given and not given[0].startswith("-") and given[0] not in COMMANDS:
+        from quad_envs.names import unknown_name
+
+        parser.error(unknown_name("command", given[0], COMMANDS))
+    found, rest = parser.parse_known_args(given)
+    command = COMMANDS[found.command]
+    refuse_unknown(rest, command.options, parser)
+    return command.run(read_options(command.options, found))
+
+
 def _input_errors() -> tuple[type[Exception], ...]:
     """What bad input raises; Gymnasium's own errors if it is loaded at all."""
     kinds: tuple[type[Exception], ...] = (ValueError, TypeError, OSError, MemoryError, OverflowError)
-    kinds = (*kinds, MissingPackageError)
+    kinds = (*kinds, MissingPackageError, RecursionError)
     gymnasium = sys.modules.get("gymnasium")
     return kinds if gymnasium is None else (*kinds, gymnasium.error.Error)
 
 
 def _one_line(error: Exception) -> str:
     """What is wrong, on one line and with the file or the cause where Python leaves it out."""
-    text = " ".join(str(error).split())
+    from quad_envs.names import shortened
+
+    text = str(error)
     if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
-    if isinstance(error, MemoryError):
-        return f"not enough memory: {text or 'choose smaller numbers'}"
-    if isinstance(error, OverflowError):
-        return f"a number is too large: {text}"
-    return text or type(error).__name__
-
-
-@contextmanager
-def _quiet_pipe() -> Iterator[None]:
-    """End without a word when the reader of a pipe, as `head`, has gone."""
-    try:
-        yield
-        sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise SystemExit(_BROKEN_PIPE) from None
+        text = f"{error.filename}: {error.strerror}"
+    elif isinstance(error, MemoryError):
+        text = f"not enough memory: {text or 'choose smaller numbers'}"
+    elif isinstance(error, OverflowError):
+        text = f"a number is too large: {text}"
+    elif isinstance(error, RecursionError):
+        text = "something is nested too deeply: look for brackets in brackets"
+    return shortened(text) or type(error).__name__
 
 
 @contextmanager

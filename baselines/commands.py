@@ -14,7 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from quad_envs.names import unknown_name
+from quad_envs.names import shortened, unknown_name
 
 from .options import BenchmarkOptions, EvaluateOptions, ListOptions, read_assignments
 
@@ -48,7 +48,7 @@ def plain_warnings() -> Iterator[None]:
     said: set[str] = set()
 
     def show(message: Warning | str, *details: Any, **more: Any) -> None:
-        text = " ".join(str(message).split())
+        text = shortened(str(message))
         if text not in said:
             said.add(text)
             say(f"quad-envs: warning: {text}")

@@ -15,8 +15,10 @@ from quad_envs.tasks import BaseTask
 
 from .outside import import_named
 
+_RESERVED = {"id", "env_id", "self"}  # what makers of environments call what is theirs
 
-def make_env(env_id: str, **kwargs: Any) -> Any:
+
+def make_env(env_id: str, /, **kwargs: Any) -> Any:
     """`gymnasium.make`, or the ParallelEnv of a multi-agent id; an unknown id gets the nearest one suggested.
 
     Args:
@@ -26,6 +28,9 @@ def make_env(env_id: str, **kwargs: Any) -> Any:
     Raises:
         ValueError: If the id or an argument is unknown or not allowed.
     """
+    reserved = sorted(_RESERVED & set(kwargs))
+    if reserved:
+        raise ValueError(f"{reserved[0]!r} is no argument of an environment that can be chosen: leave it out")
     module, _, name = env_id.rpartition(":")
     if module:
         import_named(module, f"environment {env_id!r}")

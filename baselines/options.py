@@ -176,7 +176,9 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Exit with code 2."""
-        self.exit(2, f"{self.prog}: error: {message} (--help shows what there is)\n")
+        from quad_envs.names import shortened  # here, so that --help need not load Gymnasium
+
+        self.exit(2, f"{self.prog}: error: {shortened(message)} (--help shows what there is)\n")
 
 
 def add_options(parser: argparse.ArgumentParser, kind: type[Any]) -> None:
@@ -219,13 +221,13 @@ def refuse_unknown(rest: Sequence[str], kind: type[Any], parser: Parser) -> None
     """One clear line about arguments that no option takes."""
     if not rest:
         return
-    from quad_envs.names import unknown_name  # here, so that --help need not load Gymnasium
+    from quad_envs.names import shown, unknown_name
 
     hints = get_type_hints(kind, include_extras=True)
     known = [_flag(name) for name, hint in hints.items() if not isinstance(get_args(hint)[1], Positional)]
     name = rest[0].split("=")[0]
     parser.error(
-        unknown_name("option", name, known) if name.startswith("-") else f"unexpected argument {name!r}"
+        unknown_name("option", name, known) if name.startswith("-") else f"unexpected argument {shown(name)}"
     )
 
 
@@ -235,20 +237,17 @@ def read_assignments(flag: str, texts: Sequence[str]) -> dict[str, Any]:
     Raises:
         ValueError: If one has no '=', a key comes twice, or a value begins with a bracket and is no mapping.
     """
+    from quad_envs.names import shown
+
     out: dict[str, Any] = {}
     for text in texts:
         key, equals, value = text.partition("=")
         if not equals or not key:
-            raise ValueError(f"{flag} needs KEY=VALUE, as {flag} kappa=0.3125; got {_short(text)}")
+            raise ValueError(f"{flag} needs KEY=VALUE, as {flag} kappa=0.3125; got {shown(text)}")
         if key in out:
-            raise ValueError(f"{flag} sets {_short(key)} twice")
+            raise ValueError(f"{flag} sets {shown(key)} twice")
         try:
             out[key] = read_value(value)
         except ValueError as error:
-            raise ValueError(f"{flag} {_short(key)}: {error}") from None
+            raise ValueError(f"{flag} {shown(key)}: {error}") from None
     return out
-
-
-def _short(text: str) -> str:
-    """A text in a message."""
-    return repr(text if len(text) <= 60 else f"{text[:57]}...")

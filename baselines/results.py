@@ -102,10 +102,17 @@ def read_json(path: Path) -> Any:
         ResultsError: If it cannot be read.
     """
     try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        return _parsed(path)
+    except (OSError, ValueError, RecursionError) as error:
         remedy = "choose another folder" if path.name == "config.json" else "delete it to fly this unit again"
         raise ResultsError(f"cannot read {str(path)!r}: {error}; {remedy}") from error
+
+
+def _parsed(path: Path) -> Any:
+    """What a JSON file says; a pipe or a device is none, and would never end."""
+    if path.exists() and not path.is_file():
+        raise ValueError("it is not a regular file")
+    return json.loads(path.read_text())
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -213,8 +220,8 @@ def _acquire(descriptor: int) -> None:
 
 def _owner(path: Path) -> dict[str, Any]:
     try:
-        found = json.loads(path.read_text())
-    except (OSError, ValueError):
+        found = _parsed(path)
+    except (OSError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
 

@@ -35,7 +35,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
 
-from quad_envs.names import unknown_name
+from quad_envs.names import shown, unknown_name
 from quad_envs.registration import TEAMS, TRACKING
 
 from .policy import TEAM_POLICIES, TRACKING_POLICIES, from_outside
@@ -101,6 +101,8 @@ def _checked(table: dict[str, Any], kind: type[Any], suite: str) -> dict[str, An
             raise ValueError(unknown_name(f"key in suite {suite!r}:", name, known))
     if key not in table:
         raise ValueError(f"suite {suite!r}: each table needs {key!r}, got {table}")
+    if not isinstance(table[key], str):
+        raise ValueError(f"suite {suite!r}: {key} must be text, got {shown(table[key])}")
     if table.get("train", 0) is None:
         del table["train"]
     allowed = _allowed(kind, table)
@@ -151,6 +153,11 @@ def _trainings(table: Any, suite: str) -> list[Training]:
         if name not in (*known, "seeds"):
             raise ValueError(unknown_name(f"key of train in suite {suite!r}:", name, [*known, "seeds"]))
     given = {name: value for name, value in table.items() if name != "seeds"}
+    if not isinstance(given.get("hyper", {}), Mapping):
+        raise ValueError(
+            f"suite {suite!r}: hyper of a training must be a table, as {{rows = 64}}, "
+            f"got {shown(given['hyper'])}"
+        )
     seeds = table.get("seeds", [given.pop("seed", 0)])
     if not isinstance(seeds, Sequence) or isinstance(seeds, str) or not seeds:
         raise ValueError(f"suite {suite!r}: seeds of a training must be a list, as [0, 1], got {seeds!r}")
@@ -207,5 +214,7 @@ def _read_suite(path: Path) -> Suite:
         raise ValueError(f"cannot read suite file {str(path)!r}: {error.strerror or error}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"suite file {str(path)!r} is not valid TOML: {error}") from error
+    except RecursionError:
+        raise ValueError(f"suite file {str(path)!r} has brackets nested too deeply to be read") from None
     except ValueError as error:
         raise ValueError(f"suite file {str(path)!r}: {error}") from error

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from reprlib import Repr
 
 _MOST_DIGITS = 40
+_WORD, _LINE = 240, 2000  # characters
 
 
 class _Short(Repr):
@@ -33,6 +34,13 @@ def shown(value: object, most: int = 80) -> str:
     except Exception:  # of somebody else's class
         text = f"a {type(value).__name__}"
     return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
+def shortened(text: str) -> str:
+    """A message on one line: words as long as no path or name needs are cut, and so is what never ends."""
+    words = (word if len(word) <= _WORD else f"{word[: _WORD // 2]}...{word[-20:]}" for word in text.split())
+    line = " ".join(words)
+    return line if len(line) <= _LINE else f"{line[: _LINE - 3]}..."
 
 
 def nearest_name(name: object, known: Iterable[str]) -> str | None:

@@ -124,11 +124,15 @@ def read_contenders(folder: Path) -> dict[str, list[dict[str, str]]]:
     """Rows of contenders.csv by the title of the environment as flown; none where nothing was trained."""
     path = folder / "contenders.csv"
     out: dict[str, list[dict[str, str]]] = {}
-    if path.is_file():
+    if not path.is_file():
+        return out
+    try:
         with open(path, newline="", encoding="utf-8") as file:
             for row in csv.DictReader(file):
                 title = f"{row['env']}, {row['condition']}" if row["condition"] else row["env"]
                 out.setdefault(title, []).append(row)
+    except (csv.Error, KeyError, ValueError) as error:
+        raise ResultsError(f"{str(path)!r} is not ours ({error!r}); delete it") from error
     return out
 
 

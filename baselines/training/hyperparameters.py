@@ -12,7 +12,8 @@ from dataclasses import MISSING, asdict, fields
 from importlib import resources
 from typing import Any
 
-from quad_envs.names import unknown_name
+from quad_envs.kinds import is_number
+from quad_envs.names import shown, unknown_name
 
 from .algorithms import options_of
 
@@ -67,6 +68,10 @@ def _checked(kind: type[Any], algorithm: str, name: str, value: Any, source: str
         raise ValueError(f"{unknown_name(f'hyperparameter of {algorithm!r}', name, known)} ({source})")
     default = known[name].default
     if default is MISSING or default is None or value is None:
+        if not (value is None or is_number(value) or isinstance(value, str | list | tuple)):
+            raise ValueError(
+                f"hyperparameter {name} of {algorithm!r} must be a number, text or a list, got {shown(value)}"
+            )
         return tuple(value) if isinstance(value, list) else value
     if isinstance(default, tuple):
         fits, wanted = isinstance(value, list | tuple), "a list"
@@ -82,7 +87,7 @@ def _checked(kind: type[Any], algorithm: str, name: str, value: Any, source: str
         fits, wanted = isinstance(value, type(default)), "text"
     if not fits:
         raise ValueError(
-            f"hyperparameter {name} of {algorithm!r} must be {wanted}, got {value!r} ({source}; "
+            f"hyperparameter {name} of {algorithm!r} must be {wanted}, got {shown(value)} ({source}; "
             f"default {default!r})"
         )
     return value

@@ -115,7 +115,8 @@ class RunFolder:
         """The curve so far; empty if there is none."""
         path = self.path / "curve.csv"
         points: list[Point] = []
-        with suppress(FileNotFoundError, ValueError, TypeError, KeyError), open(path, newline="") as file:
+        unreadable = (FileNotFoundError, ValueError, TypeError, KeyError, csv.Error)
+        with suppress(*unreadable), open(path, newline="") as file:
             points.extend(map(read_point, csv.DictReader(file)))
         return points
 
