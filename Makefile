@@ -19,7 +19,7 @@ EXTRAS := $(shell sed -n '/optional-dependencies/,/^\[project.scripts/s/^\([a-z]
 
 demo:
 	@test -e $(VENV)/installed || echo "install: into $(VENV), one to three minutes; then compile, about one, and fly"
-	@$(MAKE) --no-print-directory PIP="$(BIN)/python -m pip --disable-pip-version-check" $(VENV)/installed
+	@$(MAKE) -s --no-print-directory PIP="$(BIN)/python -m pip --disable-pip-version-check" $(VENV)/installed
 	@$(BIN)/quad-envs benchmark quick --fresh --out runs/demo
 	@echo "Open this page in a browser: $(CURDIR)/runs/demo/report.html"
 

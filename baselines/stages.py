@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from .policy import TEAM_POLICIES, TRACKING_POLICIES, PolicyEntry
 from .unit_flights import fly_unit
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 _OVERHEAD_MS = 0.1  # of a step beside its decision: the environment, what is recorded and measured
 _OTHERS_MS = 0.02  # a decision of a network, or of a policy whose price nobody knows
 _FEW_SECONDS = 0.2  # of flight, enough to call every kernel
+_LONG = 2.0  # s, from which a compiled policy is worth a line of its own
 _FORMAT = "{desc} {n_fmt}/{total_fmt} |{bar:20}| {postfix}"
 
 
@@ -82,9 +83,9 @@ class Progress:
         self._bar.update()
         return left
 
-    def write(self, text: str) -> None:
-        """A line above the bar."""
-        self._bar.write(text, file=sys.stderr)
+    def write(self, text: str, file: TextIO | None = None) -> None:
+        """A line above the bar, on stderr if nothing else is said."""
+        self._bar.write(text, file=sys.stderr if file is None else file)
 
     def close(self) -> None:
         """Take the bar away."""
@@ -146,9 +147,12 @@ def compile_for(units: Sequence[Unit]) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they are said when the units fly
             for count, unit in enumerate(first.values(), 1):
+                begin = perf_counter()
                 progress.describe(f"compile {unit.policy.name}")
                 fly_unit(unit)
                 left = progress.move(count, len(first))
+                if perf_counter() - begin > _LONG and count < len(first):
+                    progress.write(f"compile: {unit.policy.name} is ready; {left}")
         progress.write(f"compile: {', '.join(first)}; {left}")
     finally:
         progress.close()

@@ -1,10 +1,11 @@
 """The dissertation's tables and claims: what is printed, what we get, and the verdicts that follow."""
 
 import json
+import re
 
 import pytest
 
-from baselines.reproduce import SECTIONS, reproduce, run, tables
+from baselines.reproduce import FIGURE_SECTIONS, ORDER, SECONDS, SECTIONS, reproduce, run, tables
 from baselines.reproduce.published import TABLE_4_1, TABLE_4_2
 from baselines.reproduce.regulation_claims import comparable_claim, instability_claim, saturation_claim
 from baselines.reproduce.results import Cell, Claim, Section, verdict
@@ -163,3 +164,21 @@ def test_the_command_writes_what_it_prints(tmp_path, capsys):
 
 def test_every_section_has_a_name_of_its_own():
     assert list(SECTIONS) == ["table-4.1", "table-4.2", *(f"claims-{chapter}" for chapter in range(4, 8))]
+
+
+def test_the_command_says_which_sections_it_flies_and_how_long_the_rest_takes(capsys, monkeypatch):
+    flown = []
+    for name in ("table-4.1", "table-4.2"):
+        section = Section(name, f"title of {name}", [], [])
+        monkeypatch.setitem(SECTIONS, name, lambda jobs, s=section: flown.append(s.name) or s)
+    assert run(["table-4.1", "table-4.2"], None, False, 1) == 0
+    printed = capsys.readouterr()
+    said = printed.err.splitlines()
+    assert said[0].startswith("reproduce: table-4.1, table-4.2; about ")
+    assert re.match(r"table-4\.1: about \d+ s left", said[1]) and re.match(r"table-4\.2: took \d+ s", said[2])
+    assert "title of table-4.1" in printed.out and "left" not in printed.out
+
+
+def test_every_section_has_an_estimate():
+    assert all(seconds > 0.0 for seconds in SECONDS.values())
+    assert {*SECTIONS, *FIGURE_SECTIONS} == set(ORDER)
