@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from controllers.central_mpc import CentralMpc
 from controllers.controller import Decision
 from quad_envs.constraints import actions_from_forces
+from quad_envs.names import shown
 from quad_envs.observations import N_REFERENCE
 from quad_envs.parameters import N_INPUT, Array
 from quad_envs.tasks import TeamTask
@@ -67,7 +68,7 @@ class CentralMpcPolicy:
         )  # fmt: skip
         self._slots = np.array(task.slots, dtype=np.float64)
         if self._slots.shape != (task.vehicles, 3):
-            raise ValueError(f"central-mpc needs task.slots, one of each vehicle, got {task.slots!r}")
+            raise ValueError(f"central-mpc needs task.slots, one of each vehicle, got {shown(task.slots)}")
         self._slices = task.state_slices
         self._size = self._slices["time"].stop
         self.memory_size = self.controller.memory_size + 1 + N_INPUT * task.vehicles

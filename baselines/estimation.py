@@ -20,7 +20,7 @@ from controllers.estimation.trilateration import acceptance_limits
 from controllers.estimation.trilateration_kernels import MAX_RATIO
 from quad_envs.agent_observations import N_ESTIMATE
 from quad_envs.envs.team_kernel import ESTIMATE_REACH, ESTIMATE_SPEED
-from quad_envs.names import unknown_name
+from quad_envs.names import shown, unknown_name
 from quad_envs.parameters import Array
 from quad_envs.sensors import sensor_rows
 from quad_envs.tasks import TeamTask
@@ -132,9 +132,9 @@ def density_of(task: TeamTask, q: Any) -> float:
     """
     density = DEFAULT_Q[task.mission] if q is None else q
     if isinstance(density, bool) or not isinstance(density, int | float | np.integer | np.floating):
-        raise ValueError(f"q must be a number, m^2/s^3, got {q!r}")
+        raise ValueError(f"q must be a number, m^2/s^3, got {shown(q)}")
     if not 0.0 <= density < np.inf:
-        raise ValueError(f"q must be finite and >= 0 m^2/s^3, got {q!r}")
+        raise ValueError(f"q must be finite and >= 0 m^2/s^3, got {shown(q)}")
     return float(density)
 
 
@@ -158,7 +158,9 @@ def make_estimator(task: TeamTask, estimator: Any = None, q: Any = None) -> Agen
     usual = density_of(task, None)
     if estimator == "polar-ekf":
         if q is not None and np.shape(q) != (3,):
-            raise ValueError(f"q of 'polar-ekf' must be three densities, of V', gamma' and chi', got {q!r}")
+            raise ValueError(
+                f"q of 'polar-ekf' must be three densities, of V', gamma' and chi', got {shown(q)}"
+            )
         return OwnEstimator(task, PolarEstimator() if q is None else PolarEstimator(tuple(q)), usual)
     if estimator == "random-walk":
         return OwnEstimator(task, RandomWalkEstimator() if q is None else RandomWalkEstimator(q), usual)

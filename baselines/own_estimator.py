@@ -8,6 +8,7 @@ import numpy as np
 
 from controllers.estimation import Estimator, Measurements, Prior, ekf
 from quad_envs.agent_observations import N_MEASURED
+from quad_envs.names import shown
 from quad_envs.parameters import Array
 from quad_envs.sensors import N_MEASUREMENT, sensor_rows
 from quad_envs.tasks import TeamTask
@@ -43,7 +44,7 @@ class OwnEstimator:
         missing = [name for name in _MEMBERS if not callable(getattr(estimator, name, None))]
         size = getattr(estimator, "size", None)
         if missing or not isinstance(size, int | np.integer) or size < 0:
-            what = ", ".join(missing) if missing else f"a whole number `size` >= 0 (got {size!r})"
+            what = ", ".join(missing) if missing else f"a whole number `size` >= 0 (got {shown(size)})"
             raise ValueError(
                 f"{estimator!r} is no estimator: it lacks {what}; see controllers.estimation.Estimator"
             )

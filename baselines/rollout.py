@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
 from quad_envs.checks import require_whole
+from quad_envs.names import shown
 from quad_envs.observations import N_REFERENCE
 from quad_envs.parameters import Array
 from quad_envs.tasks import BaseTask, TeamTask
@@ -66,7 +67,7 @@ def run_episodes(
     if is_privileged(policy) and not is_parallel(env):
         raise ValueError(
             f"{type(policy).__name__} decides from the truth about one team: fly it in a ParallelEnv, "
-            f"got {env!r}"
+            f"got {shown(env)}"
         )
     if isinstance(env, VectorEnv):
         if env.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP:

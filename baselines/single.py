@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from quad_envs.names import shown
 from quad_envs.tasks import BaseTask, TeamTask
 
 from .benchmark import fly_suite
@@ -78,7 +79,7 @@ def _env_choice(env: Any) -> EnvChoice:
         return EnvChoice(env)
     require_own_task(env)
     if hasattr(env, "num_envs") and isinstance(env.unwrapped.task, TeamTask):
-        raise ValueError(f"out needs one team at a time: give parallel_env of its module, got {env!r}")
+        raise ValueError(f"out needs one team at a time: give parallel_env of its module, got {shown(env)}")
     task: BaseTask = env.unwrapped.task
     kwargs = dict(getattr(getattr(env, "spec", None), "kwargs", {}))
     kwargs.pop("env_id", None)

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from quad_envs.checks import require_whole
-from quad_envs.names import unknown_name
+from quad_envs.names import shown, unknown_name
 
 from .checks import require_episodes
 
@@ -127,7 +127,7 @@ class Suite:
     def __post_init__(self) -> None:
         for name in ("name", "compare_with"):
             if not isinstance(getattr(self, name), str):
-                raise ValueError(f"{name} of a suite must be text, got {getattr(self, name)!r}")
+                raise ValueError(f"{name} of a suite must be text, got {shown(getattr(self, name))}")
         require_episodes(f"episodes of suite {self.name!r}", self.episodes)
         require_whole(f"seed of suite {self.name!r}", self.seed, 0)
         for kind in ("envs", "policies", "conditions"):

@@ -79,12 +79,14 @@ def _choices(kind: type[_Choice], entries: Any, suite: str) -> tuple[_Choice, ..
     key = _KEYS[kind]
     if not isinstance(entries, Sequence) or isinstance(entries, str):
         raise ValueError(
-            f'suite {suite!r}: choose from a list of tables with {key!r}, or "all"; got {entries!r}'
+            f'suite {suite!r}: choose from a list of tables with {key!r}, or "all"; got {shown(entries)}'
         )
     out: list[_Choice] = []
     for entry in entries:
         if not isinstance(entry, str | Mapping):
-            raise ValueError(f"suite {suite!r}: choose by name or by a table with {key!r}, got {entry!r}")
+            raise ValueError(
+                f"suite {suite!r}: choose by name or by a table with {key!r}, got {shown(entry)}"
+            )
         table = _checked({key: entry} if isinstance(entry, str) else dict(entry), kind, suite)
         if "train" in table:
             out.extend(kind(**{**table, "train": training}) for training in _trainings(table["train"], suite))
@@ -117,7 +119,7 @@ def _checked(table: dict[str, Any], kind: type[Any], suite: str) -> dict[str, An
         raise ValueError(f"suite {suite!r}: the label of {table[key]!r} must be text, got {table['label']!r}")
     if not isinstance(table.get("shipped", False), bool):
         raise ValueError(
-            f"suite {suite!r}: shipped of {table[key]!r} must be true or false, got {table['shipped']!r}"
+            f"suite {suite!r}: shipped of {table[key]!r} must be true or false, got {shown(table['shipped'])}"
         )
     if table.get("envs"):
         table["envs"] = _names(table["envs"], table[key], suite)
@@ -148,7 +150,7 @@ def _trainings(table: Any, suite: str) -> list[Training]:
     """One training per seed."""
     known = [entry.name for entry in fields(Training)]
     if not isinstance(table, Mapping):
-        raise ValueError(f"suite {suite!r}: train must be a table, as {{seeds = [0, 1]}}, got {table!r}")
+        raise ValueError(f"suite {suite!r}: train must be a table, as {{seeds = [0, 1]}}, got {shown(table)}")
     for name in table:
         if name not in (*known, "seeds"):
             raise ValueError(unknown_name(f"key of train in suite {suite!r}:", name, [*known, "seeds"]))
@@ -160,7 +162,9 @@ def _trainings(table: Any, suite: str) -> list[Training]:
         )
     seeds = table.get("seeds", [given.pop("seed", 0)])
     if not isinstance(seeds, Sequence) or isinstance(seeds, str) or not seeds:
-        raise ValueError(f"suite {suite!r}: seeds of a training must be a list, as [0, 1], got {seeds!r}")
+        raise ValueError(
+            f"suite {suite!r}: seeds of a training must be a list, as [0, 1], got {shown(seeds)}"
+        )
     return [Training(**{**given, "seed": seed}) for seed in seeds]
 
 
@@ -168,7 +172,7 @@ def _names(value: Any, who: str, suite: str) -> tuple[str, ...]:
     """The environments of a policy or a condition."""
     if not isinstance(value, list | tuple) or not all(isinstance(name, str) for name in value):
         raise ValueError(
-            f"suite {suite!r}: envs of {who!r} must be a list of ids or labels, got {value!r}; without "
+            f"suite {suite!r}: envs of {who!r} must be a list of ids or labels, got {shown(value)}; without "
             "it all are meant"
         )
     return tuple(value)

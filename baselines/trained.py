@@ -61,9 +61,13 @@ def names_trained(name: str | os.PathLike[str]) -> bool:
         isinstance(name, os.PathLike)
         or os.sep in text
         or "/" in text
-        or (SHIPPED / text / _DESCRIPTION).is_file()
-        or Path(text).exists()
+        or _is_shipped(text)
+        or os.path.exists(text)  # which a name that is too long does not
     )
+
+
+def _is_shipped(name: str) -> bool:
+    return os.path.isfile(SHIPPED / name / _DESCRIPTION)
 
 
 def load_policy(source: str | os.PathLike[str], env: Any) -> NetworkPolicy:
@@ -107,17 +111,17 @@ def checkpoint_folder(source: str | os.PathLike[str]) -> Path:
         CheckpointError: If there is none.
     """
     text = os.fspath(source)
-    if not isinstance(source, os.PathLike) and (SHIPPED / text / _DESCRIPTION).is_file():
+    if not isinstance(source, os.PathLike) and _is_shipped(text):
         return SHIPPED / text
     path = Path(text)
-    if path.is_file():
+    if os.path.isfile(path):
         raise CheckpointError(
             f"{text!r} is a file; a trained policy is a folder with network.safetensors and {_DESCRIPTION}. "
             "Zips of Stable-Baselines3 and .pt files of torch are pickles, which are never opened: quad-envs "
             f"export {shlex.quote(text)} FOLDER makes a checkpoint of a zip, baselines.export_policy of a "
             "torch module; a policy of your own in a .py file is named module:factory, as mypolicy:make"
         )
-    if not path.is_dir():
+    if not os.path.isdir(path):
         shipped = unknown_name("trained policy", text, shipped_policies())
-        raise CheckpointError(f"there is no folder {text!r}, and it is not shipped: {shipped}")
+        raise CheckpointError(f"there is no folder {shown(text, 200)}, and it is not shipped: {shipped}")
     return path

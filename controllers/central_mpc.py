@@ -24,6 +24,7 @@ import scipy.sparse as sparse
 from numpy.typing import ArrayLike, NDArray
 
 from quad_envs.checks import array_bytes, require_memory, require_whole
+from quad_envs.names import shown
 from quad_envs.observations import N_REFERENCE
 from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, VELOCITY, Array
 from quad_envs.rotations import rotation_body_from_inertial, wrap_angle
@@ -113,11 +114,11 @@ class CentralMpc:
             )
         horizon = require_horizon(horizon)
         if not 0.0 <= alpha <= 1.0:
-            raise ValueError(f"alpha must lie in [0, 1], got {alpha!r}")
+            raise ValueError(f"alpha must lie in [0, 1], got {shown(alpha)}")
         if not (0.0 <= braking_time < math.inf and abs(swirl) < math.pi / 2 and separation_weight > 0.0):
             raise ValueError(
                 "braking_time must be >= 0 s, |swirl| < pi/2 rad and separation_weight > 0, "
-                f"got {braking_time!r}, {swirl!r}, {separation_weight!r}"
+                f"got {shown(braking_time)}, {swirl!r}, {separation_weight!r}"
             )
         require_whole("max_iter", max_iter, 1, MOST_ITERATIONS)
         if not (eps > 0.0 and math.isfinite(soft_weight) and math.isfinite(separation_weight)):

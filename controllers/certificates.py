@@ -14,6 +14,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
+from quad_envs.names import shown
 from quad_envs.parameters import Array
 
 from .ocp import OcpQp
@@ -51,7 +52,7 @@ def _matrix(name: str, value: ArrayLike, shape: tuple[int, int]) -> Array:
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
     if not np.isfinite(array).all():
-        raise ValueError(f"{name} must be finite, got {array!r}")
+        raise ValueError(f"{name} must be finite, got {shown(array)}")
     return array
 
 

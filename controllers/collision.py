@@ -40,6 +40,7 @@ import numpy as np
 
 from quad_envs._numba import inline_kernel, kernel
 from quad_envs.agent_observations import COMM_AGE, COMM_WEIGHT, N_COMM, N_PLAN_STAGE
+from quad_envs.names import shown
 from quad_envs.parameters import N_STATE, Array
 from quad_envs.rotations import sincos
 
@@ -82,16 +83,16 @@ class AvoidanceOptions:
         ):
             if value not in get_args(kind):
                 raise ValueError(
-                    f"{name} must be one of {', '.join(map(repr, get_args(kind)))}, got {value!r}"
+                    f"{name} must be one of {', '.join(map(repr, get_args(kind)))}, got {shown(value)}"
                 )
         if not 0.0 <= self.braking_time < math.inf:
-            raise ValueError(f"braking_time must be finite and >= 0 s, got {self.braking_time!r}")
+            raise ValueError(f"braking_time must be finite and >= 0 s, got {shown(self.braking_time)}")
         if not abs(self.swirl) < math.pi / 2:
-            raise ValueError(f"swirl must lie in (-pi/2, pi/2) rad, got {self.swirl!r}")
+            raise ValueError(f"swirl must lie in (-pi/2, pi/2) rad, got {shown(self.swirl)}")
         if not 0.0 <= self.margin < math.inf:
-            raise ValueError(f"separation_margin must be finite and >= 0 m, got {self.margin!r}")
+            raise ValueError(f"separation_margin must be finite and >= 0 m, got {shown(self.margin)}")
         if not self.weight > 0.0:
-            raise ValueError(f"the weight of separation must be > 0 per m, got {self.weight!r}")
+            raise ValueError(f"the weight of separation must be > 0 per m, got {shown(self.weight)}")
 
     def require_plans(self, stages: int) -> None:
         """Check that messages have plans of so many stages where the rule reads them.

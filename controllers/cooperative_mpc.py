@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quad_envs.agent_observations import N_PLAN_STAGE, N_SENSED
+from quad_envs.names import shown
 from quad_envs.observations import N_REFERENCE
 from quad_envs.parameters import N_INPUT, Array
 from quad_envs.tasks import TeamTask
@@ -127,10 +128,10 @@ class CooperativeMpc:
     ) -> None:
         horizon = require_horizon(horizon)
         if not 0.0 <= alpha <= 1.0:
-            raise ValueError(f"alpha must lie in [0, 1], got {alpha!r}; 1/2 is the dissertation's")
+            raise ValueError(f"alpha must lie in [0, 1], got {shown(alpha)}; 1/2 is the dissertation's")
         require_choice("terminal_weight", terminal_weight, CooperativeTerminalWeight)
         if not plan_tilt > 0.0:
-            raise ValueError(f"plan_tilt must be > 0 rad, got {plan_tilt!r}; math.inf is no limit")
+            raise ValueError(f"plan_tilt must be > 0 rad, got {shown(plan_tilt)}; math.inf is no limit")
         self.task, self.horizon = task, horizon
         self.consensus = ConsensusOptions(
             neighbour, feed_forward, attitude, reach, speed, formation_weight, target

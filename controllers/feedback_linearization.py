@@ -9,6 +9,7 @@ import numpy as np
 
 from quad_envs._numba import kernel
 from quad_envs.dynamics import rotor_shares
+from quad_envs.names import shown
 from quad_envs.parameters import (
     GRAVITY,
     GYRO_X,
@@ -191,7 +192,7 @@ class FeedbackLinearization(FeedbackLaw):
         require_choice("frame", frame, Frame)
         for name, value in (("kp", kp), ("kd", kd), ("ka", ka), ("kad", kad)):
             if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name} must be a finite number > 0, got {value!r}")
+                raise ValueError(f"{name} must be a finite number > 0, got {shown(value)}")
         self.task = task
         self.horizon = 1 if acceleration_feed_forward else 0
         self._gains = np.array([kp, kd, ka, kad], dtype=np.float64)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quad_envs.checks import require_whole
+from quad_envs.names import shown
 from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, VELOCITY, Array, Limits
 from quad_envs.tasks import BaseTask, Task
 
@@ -54,7 +55,7 @@ def require_choice(name: str, value: object, kind: Any) -> None:
         ValueError: If it is not; names what is allowed.
     """
     if value not in get_args(kind):
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, get_args(kind)))}, got {value!r}")
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, get_args(kind)))}, got {shown(value)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,15 +85,19 @@ class MpcOptions:
         require_choice("frame", self.frame, Frame)
         require_choice("velocity_reference", self.velocity_reference, VelocityReference)
         if not self.soft_weight >= 0.0:
-            raise ValueError(f"soft_weight must be >= 0 (math.inf for hard rows), got {self.soft_weight!r}")
+            raise ValueError(
+                f"soft_weight must be >= 0 (math.inf for hard rows), got {shown(self.soft_weight)}"
+            )
         if not 0.0 <= self.margin < math.inf:
             raise ValueError(
-                f"margin must be a finite number >= 0, in SI units of each limit, got {self.margin!r}"
+                f"margin must be a finite number >= 0, in SI units of each limit, got {shown(self.margin)}"
             )
         if self.estimator_gain != "auto" and not 0.0 < self.estimator_gain <= 1.0:
-            raise ValueError(f"estimator_gain must be 'auto' or lie in (0, 1], got {self.estimator_gain!r}")
+            raise ValueError(
+                f"estimator_gain must be 'auto' or lie in (0, 1], got {shown(self.estimator_gain)}"
+            )
         if not self.plan_tilt > 0.0:
-            raise ValueError(f"plan_tilt must be > 0 rad, got {self.plan_tilt!r}; math.inf is no limit")
+            raise ValueError(f"plan_tilt must be > 0 rad, got {shown(self.plan_tilt)}; math.inf is no limit")
         require_whole(
             "iteration_limit (0: one that grows with the problem)", self.iteration_limit, 0, MOST_ITERATIONS
         )

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_envs.names import shown
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 
 IntArray = NDArray[np.int64]
@@ -206,7 +207,7 @@ def _require_symmetric(name: str, value: Array) -> None:
 
 def _require_indices(name: str, value: IntArray, count: int, low: int, high: int) -> None:
     if not isinstance(value, np.ndarray) or value.dtype != np.int64 or value.shape != (count,):
-        raise ValueError(f"{name} must be int64 of shape ({count},), one entry per row, got {value!r}")
+        raise ValueError(f"{name} must be int64 of shape ({count},), one entry per row, got {shown(value)}")
     if not value.flags.c_contiguous:
         raise ValueError(f"{name} must be C-contiguous, use np.ascontiguousarray")
     if count and (value.min() < low or value.max() > high):

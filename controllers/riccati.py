@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from quad_envs._numba import kernel
+from quad_envs.names import shown
 from quad_envs.parameters import Array
 
 from .linalg import add_matvec_transposed, copy, fill, lu_solve, matmul, symmetrise, transpose
@@ -371,10 +372,10 @@ def dare(A: Array, B: Array, Q: Array, R: Array) -> Array:
     A, Q, R = _square("A", A, n), _square("Q", Q, n), _square("R", R, m)
     for name, value in (("A", A), ("B", B), ("Q", Q), ("R", R)):
         if not np.isfinite(value).all():
-            raise ValueError(f"{name} must be finite, got {value!r}")
+            raise ValueError(f"{name} must be finite, got {shown(value)}")
     for name, value in (("Q", Q), ("R", R)):
         if not np.allclose(value, value.T, rtol=1e-12, atol=1e-12 * float(np.abs(value).max())):
-            raise ValueError(f"{name} must be symmetric, use ({name} + {name}.T) / 2; got {value!r}")
+            raise ValueError(f"{name} must be symmetric, use ({name} + {name}.T) / 2; got {shown(value)}")
     smallest = float(np.linalg.eigvalsh(R)[0])
     if smallest <= 0.0:
         raise ValueError(f"R must be positive definite, its smallest eigenvalue is {smallest}")

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from quad_envs._numba import kernel
 from quad_envs.checks import require_whole
+from quad_envs.names import shown
 from quad_envs.parameters import N_STATE, Array
 from quad_envs.tasks import Task
 
@@ -236,7 +237,7 @@ class SdcNmpc(Mpc):
     ) -> None:
         if not 0.0 <= alpha <= 1.0:
             raise ValueError(
-                f"alpha must lie in [0, 1], got {alpha!r}; 1/2 is the dissertation's, 1 recommended"
+                f"alpha must lie in [0, 1], got {shown(alpha)}; 1/2 is the dissertation's, 1 recommended"
             )
         if isinstance(relinearisations, str) and relinearisations == "auto":
             passes = 1 if frame == "heading" else 0

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quad_envs._numba import kernel
+from quad_envs.names import shown
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 from quad_envs.tasks import Task
 
@@ -137,7 +138,7 @@ class Sdre(FeedbackLaw):
     ) -> None:
         if not 0.0 <= alpha <= 1.0:
             raise ValueError(
-                f"alpha must lie in [0, 1], got {alpha!r}; 1/2 is the dissertation's, 1 recommended"
+                f"alpha must lie in [0, 1], got {shown(alpha)}; 1/2 is the dissertation's, 1 recommended"
             )
         self._prepare(task, float(alpha), frame, velocity_reference)
 

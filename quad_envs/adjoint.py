@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from ._numba import inline_kernel, kernel
 from .dynamics import rigid_body, rotor_limits
+from .names import shown
 from .parameters import (
     DRAG_RATE,
     GRAVITY,
@@ -287,7 +288,7 @@ def step_vjp(
         ValueError: If substeps is out of range.
     """
     if not 1 <= substeps <= _MOST_SUBSTEPS:
-        raise ValueError(f"substeps must be 1 to {_MOST_SUBSTEPS}, got {substeps!r}")
+        raise ValueError(f"substeps must be 1 to {_MOST_SUBSTEPS}, got {shown(substeps)}")
     plants = np.ascontiguousarray(plant, dtype=np.float64)
     shape = plants.shape[:-1]
     commands, bars = (

@@ -63,9 +63,9 @@ class TorquePulse:
 
     def __post_init__(self) -> None:
         if self.clock not in ("absolute", "relative"):
-            raise ValueError(f"clock must be 'absolute' or 'relative', got {self.clock!r}")
+            raise ValueError(f"clock must be 'absolute' or 'relative', got {shown(self.clock)}")
         if not self.start < self.stop:
-            raise ValueError(f"a pulse needs start < stop, got {self.start!r} and {self.stop!r} s")
+            raise ValueError(f"a pulse needs start < stop, got {shown(self.start)} and {self.stop!r} s")
 
     def size(self) -> Array:
         """Largest value of each component, (6,)."""
@@ -136,10 +136,10 @@ class Gusts:
             if size.shape not in ((), (3,)) or not (np.isfinite(size).all() and (size >= 0.0).all()):
                 raise ValueError(
                     f"{name} of gusts must be None, one standard deviation >= 0 or three of them, {unit}, "
-                    f"got {value!r}"
+                    f"got {shown(value)}"
                 )
         if not self.correlation_time > 0.0:
-            raise ValueError(f"correlation_time must be > 0 s, got {self.correlation_time!r}")
+            raise ValueError(f"correlation_time must be > 0 s, got {shown(self.correlation_time)}")
 
     def for_vehicle(self, params: QuadrotorParams, limits: Limits) -> Gusts:
         """These gusts with the deviations that are None in numbers of a vehicle."""

@@ -254,7 +254,7 @@ class Switching:
         object.__setattr__(self, "graphs", _frozen(self.graphs))
         dwell = self.dwell_steps
         if isinstance(dwell, bool) or not isinstance(dwell, int | np.integer) or dwell < 1:
-            raise ValueError(f"dwell_steps must be an integer >= 1, got {dwell!r}")
+            raise ValueError(f"dwell_steps must be an integer >= 1, got {shown(dwell)}")
 
     def which(self, steps: int, dt: float) -> NDArray[np.int64]:
         """Number of the graph at steps 0 .. steps, (steps + 1,)."""

@@ -114,8 +114,8 @@ class QuadrotorParams:
         for axis, moment in zip("xyz", self.inertia, strict=True):
             require_number(f"inertia J{axis}", moment, _MOMENT)
         require_inertia(self.inertia)
-        if self.frame not in FRAMES:
-            raise ValueError(f"frame must be one of {', '.join(map(repr, FRAMES))}, got {self.frame!r}")
+        if not isinstance(self.frame, str) or self.frame not in FRAMES:
+            raise ValueError(f"frame must be one of {', '.join(map(repr, FRAMES))}, got {shown(self.frame)}")
 
     @property
     def weight(self) -> float:
@@ -199,13 +199,13 @@ class Limits:
 
     def __post_init__(self) -> None:
         if len(self.kappas) != N_INPUT:
-            raise ValueError(f"kappa must be one number or one per rotor, got {self.kappa!r}")
+            raise ValueError(f"kappa must be one number or one per rotor, got {shown(self.kappa)}")
         for i, kappa in enumerate(self.kappas):
             if not (is_number(kappa) and 0.25 < kappa <= MOST_KAPPA):
                 which = f" for rotor {i + 1}" if isinstance(self.kappa, tuple) else ""
                 raise ValueError(
                     "kappa, the largest rotor force as a fraction of the weight, must lie in "
-                    f"(1/4, {MOST_KAPPA:g}], got {kappa!r}{which}; hover needs m g / 4 of every rotor. "
+                    f"(1/4, {MOST_KAPPA:g}], got {shown(kappa)}{which}; hover needs m g / 4 of every rotor. "
                     "It is a quarter of the thrust-to-weight ratio; 0.3125 gives the dissertation's 2.45 N"
                 )
         for name, unit in (("rate", "N/s"), ("tilt", "rad"), ("velocity", "m/s")):
@@ -218,7 +218,7 @@ class Limits:
                     f"from rounding, got {shown(value)}"
                 )
         if math.isfinite(self.tilt) and self.tilt >= math.pi / 2:
-            raise ValueError(f"tilt limit must be below pi/2 rad (math.inf for none), got {self.tilt!r}")
+            raise ValueError(f"tilt limit must be below pi/2 rad (math.inf for none), got {shown(self.tilt)}")
         if len(self.position_lower) != 3 or len(self.position_upper) != 3:
             raise ValueError("position limits need three numbers (x, y, z), m")
         for axis, low, high in zip("xyz", self.position_lower, self.position_upper, strict=True):

@@ -60,7 +60,7 @@ def _require_finite(target: object, *names: str) -> None:
         value = getattr(target, name)
         shape, what = ((3,), "three finite numbers") if name in _VECTORS else ((), "a finite number")
         if np.shape(value) != shape or not np.isfinite(np.asarray(value, dtype=np.float64)).all():
-            raise ValueError(f"{name} of {type(target).__name__} must be {what}, got {value!r}")
+            raise ValueError(f"{name} of {type(target).__name__} must be {what}, got {shown(value)}")
 
 
 def _require_times(t: Array) -> None:
@@ -107,7 +107,7 @@ class ConstantVelocity:
     def __post_init__(self) -> None:
         _require_finite(self, "position", "velocity", "q")
         if self.q < 0.0:
-            raise ValueError(f"q of ConstantVelocity must be >= 0 m^2/s^3, got {self.q!r}")
+            raise ValueError(f"q of ConstantVelocity must be >= 0 m^2/s^3, got {shown(self.q)}")
 
     @property
     def random(self) -> bool:
@@ -191,10 +191,10 @@ class Aircraft:
         if self.speed < _LEAST_SPEED or abs(self.climb) > _LARGEST_CLIMB:
             raise ValueError(
                 f"an aircraft needs speed >= {_LEAST_SPEED} m/s and |climb| <= {_LARGEST_CLIMB:.3f} rad, "
-                f"got {self.speed!r} and {self.climb!r}"
+                f"got {shown(self.speed)} and {self.climb!r}"
             )
         if not callable(self.manoeuvre):
-            raise ValueError(f"manoeuvre must be a function of time, got {self.manoeuvre!r}")
+            raise ValueError(f"manoeuvre must be a function of time, got {shown(self.manoeuvre)}")
         self._inputs(0.0)
 
     def rows(self, t: Array, rng: np.random.Generator) -> Array:
@@ -241,7 +241,8 @@ class Aircraft:
         inputs = self.manoeuvre(t)
         if np.shape(inputs) != (3,) or not all(map(math.isfinite, inputs)):
             raise ValueError(
-                f"manoeuvre must return three finite numbers (V_c, a_v, a_h), got {inputs!r} at t = {t:g} s"
+                f"manoeuvre must return three finite numbers (V_c, a_v, a_h), got {shown(inputs)} "
+                f"at t = {t:g} s"
             )
         return inputs
 

@@ -167,11 +167,11 @@ def _check_numbers(options: PpoOptions | SacOptions) -> None:
     for name in {field.name for field in fields(options)} & {*_POSITIVE, *_SHARES}:
         value = getattr(options, name)
         if not 0.0 <= value < math.inf or (name in _POSITIVE and value == 0.0):
-            raise ValueError(f"hyperparameter {name} must be finite and positive, got {value!r}")
+            raise ValueError(f"hyperparameter {name} must be finite and positive, got {shown(value)}")
         if name in _SHARES and value > 1.0:
-            raise ValueError(f"hyperparameter {name} must be at most 1, got {value!r}")
+            raise ValueError(f"hyperparameter {name} must be at most 1, got {shown(value)}")
     if options.episode_steps is not None and options.episode_steps < 1:
-        raise ValueError(f"hyperparameter episode_steps must be >= 1, got {options.episode_steps!r}")
+        raise ValueError(f"hyperparameter episode_steps must be >= 1, got {shown(options.episode_steps)}")
     if not options.hidden or min(options.hidden) < 1:
         raise ValueError(
             f"hyperparameter hidden needs at least one layer, of widths >= 1: {options.hidden!r}"

@@ -7,6 +7,7 @@ from dataclasses import replace
 from quad_envs.envs.options import TrackingOptions
 from quad_envs.envs.team_options import TeamOptions
 from quad_envs.graphs import in_neighbours
+from quad_envs.names import shown
 
 from .networks import Features, default_features
 
@@ -26,7 +27,7 @@ def training_features(
     layout = options.task.layout
     if stages is not None and not set(stages) <= set(range(layout.preview + 1)):
         raise ValueError(
-            f"hyperparameter stages: the preview has stages 0 to {layout.preview}, got {stages!r}"
+            f"hyperparameter stages: the preview has stages 0 to {layout.preview}, got {shown(stages)}"
         )
     features = default_features(layout, stages)
     if not isinstance(options, TeamOptions):

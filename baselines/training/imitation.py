@@ -17,6 +17,7 @@ from quad_envs.envs.options import TrackingOptions
 from quad_envs.envs.team_options import TeamOptions
 from quad_envs.envs.team_vector import TeamVectorEnv
 from quad_envs.envs.tracking_vector import TrackingVectorEnv
+from quad_envs.names import shown
 from quad_envs.tasks import BaseTask, TeamTask
 
 from ..errors import TrainingError
@@ -149,7 +150,7 @@ def make_expert(name: str, task: BaseTask, separation: float | None = None) -> P
     if separation is not None:
         if not isinstance(task, TeamTask) or not separation >= task.separation:
             raise ValueError(
-                f"hyperparameter separation is for teams, and at least their own, got {separation!r} m"
+                f"hyperparameter separation is for teams, and at least their own, got {shown(separation)} m"
             )
         task = replace(task, separation=separation)
     expert = make_policy(name or _EXPERTS[mission], task)

@@ -185,7 +185,7 @@ class Network:
                 )
         clip = self.features.clip
         if clip is not None and not (np.isfinite(clip) and clip > 0.0):
-            raise ValueError(f"clip of a network's features must be finite and > 0, got {clip!r}")
+            raise ValueError(f"clip of a network's features must be finite and > 0, got {shown(clip)}")
         self._check_overflow()
 
     def _check_overflow(self) -> None:
@@ -272,7 +272,7 @@ class NetworkPolicy:
 
     def __init__(self, network: Network, task: BaseTask, name: str, kind: str = "") -> None:
         if not isinstance(task, Task | TeamTask):
-            raise ValueError(f"a network needs a Task or a TeamTask, got {task!r}")
+            raise ValueError(f"a network needs a Task or a TeamTask, got {shown(task)}")
         size = task.action_size if isinstance(task, TeamTask) else 4
         if network.outputs != size:
             raise ValueError(

@@ -22,6 +22,7 @@ from quad_envs.envs.kernel import COST, CRASHED, REWARD, TRUNCATED, VIOLATED
 from quad_envs.envs.options import TrackingOptions
 from quad_envs.envs.team_batch import TeamBatch
 from quad_envs.envs.team_options import TeamOptions
+from quad_envs.names import shown
 from quad_envs.tasks import Task, TeamTask
 
 from .networks import Features, Floats, default_features, hover_actions
@@ -73,7 +74,7 @@ class TrainingVecEnv(VecEnv):
         episode_steps: int | None = None,
     ) -> None:
         if n < 1:
-            raise ValueError(f"the number of flights or teams must be >= 1, got {n!r}")
+            raise ValueError(f"the number of flights or teams must be >= 1, got {shown(n)}")
         self._batch: TrackingBatch | TeamBatch
         if isinstance(options, TeamOptions):
             self._batch = TeamBatch(replace(options, terminate="team"), n)

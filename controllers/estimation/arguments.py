@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_envs.names import shown
 from quad_envs.parameters import Array
 
 BoolArray = NDArray[np.bool_]
@@ -47,7 +48,7 @@ def require_non_negative(name: str, value: float, unit: str) -> float:
         ValueError: If it is negative or not finite.
     """
     if not 0.0 <= value < np.inf:
-        raise ValueError(f"{name} must be a finite number >= 0 {unit}, got {value!r}")
+        raise ValueError(f"{name} must be a finite number >= 0 {unit}, got {shown(value)}")
     return float(value)
 
 

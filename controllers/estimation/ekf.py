@@ -43,6 +43,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quad_envs._numba import Int, kernel
+from quad_envs.names import shown
 from quad_envs.parameters import Array
 from quad_envs.sensors import N_MEASUREMENT
 
@@ -236,7 +237,7 @@ def update(
     if not (noise > 0.0).all():
         raise ValueError(f"sigma must be three standard deviations > 0 (m, rad, rad), got {noise}")
     if rows not in (1, N_MEASUREMENT):
-        raise ValueError(f"rows must be 1 (range) or {N_MEASUREMENT} (with both angles), got {rows!r}")
+        raise ValueError(f"rows must be 1 (range) or {N_MEASUREMENT} (with both angles), got {shown(rows)}")
     nis, counts = np.empty(n), np.empty((2, n), dtype=np.int64)
     mask, restarted = as_mask("valid", valid, (n, m)), np.empty(n, dtype=np.bool_)
     anew = np.empty(0) if restart is None else restart.data()

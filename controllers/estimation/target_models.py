@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from quad_envs.names import shown
 from quad_envs.parameters import Array
 from quad_envs.sensors import N_MEASUREMENT
 
@@ -133,7 +134,7 @@ class RandomWalkEstimator:
 
     def __init__(self, q: float = RANDOM_WALK_NOISE) -> None:
         if not 0.0 <= q < math.inf:
-            raise ValueError(f"q of a random walk must be finite and >= 0 m^2/s, got {q!r}")
+            raise ValueError(f"q of a random walk must be finite and >= 0 m^2/s, got {shown(q)}")
         self.q = float(q)
 
     def begin(self, prior: Prior) -> Array:

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quad_envs._numba import kernel
+from quad_envs.names import shown
 from quad_envs.parameters import Array
 
 from .arguments import BoolArray, IntArray, as_floats, as_mask
@@ -113,7 +114,7 @@ def trilaterate(
     n, m, _ = places.shape
     ranges = as_floats("distance", distance, (n, m), finite=False)
     if not 0.0 < sigma < np.inf:
-        raise ValueError(f"sigma must be a finite number > 0 m, got {sigma!r}")
+        raise ValueError(f"sigma must be a finite number > 0 m, got {shown(sigma)}")
     guess = np.full((n, 3), np.nan) if start is None else as_floats("start", start, (n, 3), finite=False)
     r, P, numbers, reason = (
         np.empty((n, 3)),

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from ..graphs import GraphTable
+from ..names import shown
 from ..observations import N_REFERENCE
 from ..parameters import Array
 from ..tasks import TeamTask
@@ -244,7 +245,7 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
             if np.shape(action) != (self._action_size,) or not np.issubdtype(
                 np.asarray(action).dtype, np.number
             ):
-                raise ValueError(f"action of {name} must be {self._action_size} numbers, got {action!r}")
+                raise ValueError(f"action of {name} must be {self._action_size} numbers, got {shown(action)}")
 
     def _infos(self) -> dict[str, Named]:
         rows = self._batch.rows if len(self._rows) == len(self._batch.rows) else self._batch.rows[self._rows]

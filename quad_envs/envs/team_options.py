@@ -205,7 +205,7 @@ class TeamOptions(VehicleOptions):
         """
         slots, graphs = self.make_slots(), self.graphs
         if len(slots) != self.vehicles:
-            raise ValueError(f"vehicles must be {len(slots)}, one per slot, got {self.vehicles!r}")
+            raise ValueError(f"vehicles must be {len(slots)}, one per slot, got {shown(self.vehicles)}")
         in_degree = in_neighbours(graphs.graphs).shape[1]
         crowd = self.vehicles > FEW_VEHICLES
         for name in ("neighbours", "sensed"):
@@ -308,7 +308,7 @@ class TargetTrackingOptions(TeamOptions):
         if not isinstance(self.sensor_sigma, tuple):
             raise ValueError(
                 "sensor_sigma must be three standard deviations, of range, m, azimuth, rad, and elevation, "
-                f"rad; got {self.sensor_sigma!r}"
+                f"rad; got {shown(self.sensor_sigma)}"
             )
         for name, length in (
             *(("sensor_sigma", 3), ("prior_velocity", 3), ("prior_sigma", 2), ("target_spread", 2)),
@@ -363,11 +363,13 @@ class TargetTrackingOptions(TeamOptions):
             return []
         if isinstance(self.measuring, str):
             if self.measuring != "all":
-                raise ValueError(f"measuring must be 'all' or vehicle numbers, got {self.measuring!r}")
+                raise ValueError(f"measuring must be 'all' or vehicle numbers, got {shown(self.measuring)}")
             return list(range(self.vehicles))
+        if not isinstance(self.measuring, tuple):
+            raise ValueError(f"measuring must be 'all' or vehicle numbers, got {shown(self.measuring)}")
         for i in self.measuring:
             if isinstance(i, bool) or not isinstance(i, int | np.integer) or not 0 <= i < self.vehicles:
-                raise ValueError(f"measuring names vehicle {i!r}; there are 0 .. {self.vehicles - 1}")
+                raise ValueError(f"measuring names vehicle {shown(i)}; there are 0 .. {self.vehicles - 1}")
         return [int(i) for i in self.measuring]
 
     def _target_fields(self) -> dict[str, Any]:

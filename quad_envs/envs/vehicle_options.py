@@ -97,6 +97,7 @@ class VehicleOptions:
             raise ValueError(f"reward must be 'bounded' or 'quadratic', got {shown(self.reward)}")
         # Build what can be built, so that a bad value is refused here and not at the first reset.
         self.make_limits()
+        self.make_params()
         self._require_followed_drag(self.randomization())
         self.noise_deviations()
         excess = beyond_authority(self.make_disturbance(), self.make_params(), self.make_limits())
