@@ -21,7 +21,7 @@ from .mpc import (
     MpcOptions,
     Problem,
     SolverName,
-    VelocityReference,
+    VelocityAxes,
     default_tilt,
 )
 from .mpc_kernels import MpcData, Scratch, begin_row, carve, end_row, hold_trim, left_model, solve_within_tilt
@@ -78,8 +78,10 @@ class LinearMPC(Mpc):
         horizon: N, samples.
         solver: "structured" (exact, one compiled call) or "osqp".
         frame: "heading" or "hover".
-        velocity_reference: How v_ref is turned before it is compared with V_B, in frame "heading": by the
-            present "heading", or by the whole present "attitude", which costs up to 3 times less here.
+        velocity_reference: What is compared with v_ref in frame "heading". "level": the velocity, turned by
+            the present attitude into the level axes of v_ref, which is the rate of the position, too.
+            "attitude": V_B, with v_ref turned into its axes; "heading": V_B, with v_ref as it is. Both move
+            positions by V_B: the longer the horizon, the more that costs.
         soft_weight: Exact penalty per unit of a state row; inf makes the rows hard.
         margin: What the plan keeps from each state limit, in its SI unit: cover for the unmodelled rotor lag.
         reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
@@ -105,7 +107,7 @@ class LinearMPC(Mpc):
         *,
         solver: SolverName = "structured",
         frame: Frame = "heading",
-        velocity_reference: VelocityReference = "attitude",
+        velocity_reference: VelocityAxes = "level",
         soft_weight: float = SOFT_WEIGHT,
         margin: float = 0.02,
         reject_disturbance: bool = False,

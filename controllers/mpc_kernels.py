@@ -57,6 +57,7 @@ class MpcData(NamedTuple):
     gain: Array  # (6,), of the disturbance estimator, 0 for none
     heading: bool  # whether the problem is posed at the present position and heading
     attitude: bool  # whether v_ref is turned into the present body axes
+    level: bool  # whether the model's velocity stands in level axes, as v_ref, instead of in body axes
     kinematics: bool  # whether the model turns body rates into Euler rates at the present attitude
     iteration_limit: int
     plan_tilt: float  # rad, of the plan's own rows, inf for none
@@ -165,6 +166,21 @@ def set_state(plant: Array, heading: bool, x_0: Array) -> None:
         x_0[i] = plant[i]
     if heading:
         x_0[0], x_0[1], x_0[2], x_0[8] = 0.0, 0.0, 0.0, 0.0
+
+
+@kernel
+def level_velocity(x_0: Array) -> None:
+    """V_B of x_0 becomes the velocity in level axes, in place: what the hover model takes for p'.
+
+    Near hover both axes are one, and the matrices are the same. But a vehicle that climbs at 3 m/s and rolls
+    by 0.1 rad has 0.3 m/s of lateral V_B and does not move sideways: predicted from V_B, it would drift by
+    that, the farther the longer the horizon.
+    """
+    sf, cf = sincos(x_0[6])
+    st, ct = sincos(x_0[7])
+    u, v, w = x_0[3], x_0[4], x_0[5]
+    under = sf * v + cf * w
+    x_0[3], x_0[4], x_0[5] = ct * u + st * under, cf * v - sf * w, ct * under - st * u
 
 
 @kernel
@@ -347,6 +363,8 @@ def begin_row(
         s.d[3], s.d[4] = cosine * s.d[3] + sine * s.d[4], cosine * s.d[4] - sine * s.d[3]
     set_state(plant, data.heading, s.x_0)
     add_rotor_lag(plant, s.offset, data.B_c, data.lag, s.x_0)
+    if data.level:
+        level_velocity(s.x_0)
     set_references(plant, window, s.trim, data.heading, data.attitude, data.kinematics, N + 1, data.dt, s.r)
     for a in range(N_INPUT):
         s.lower[a] = -s.offset[a]

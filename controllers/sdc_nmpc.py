@@ -194,7 +194,8 @@ class SdcNmpc(Mpc):
         terminal_weight: "hover": P of the hover model; "sdre": P of the present pair.
         solver: See `LinearMPC`, as the options that follow.
         frame: "heading" or "hover".
-        velocity_reference: "heading" or "attitude".
+        velocity_reference: How v_ref is turned before it is compared with V_B, in frame "heading": by the
+            present "heading", or by the whole present "attitude".
         soft_weight: Exact penalty per unit of a state row; inf makes the rows hard.
         margin: What the plan keeps from each state limit, in its SI unit: cover for the unmodelled rotor lag.
         reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
@@ -244,6 +245,7 @@ class SdcNmpc(Mpc):
         else:
             require_whole("relinearisations, if not 'auto',", relinearisations, 0, MOST_PASSES)
             passes = int(relinearisations)
+        require_choice("velocity_reference", velocity_reference, VelocityReference)
         require_choice("terminal_weight", terminal_weight, TerminalWeight)
         options = MpcOptions(
             solver,

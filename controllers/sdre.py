@@ -120,7 +120,7 @@ class Sdre(FeedbackLaw):
         task: What is known of the flight.
         alpha: Member of the family of factorisations, in [0, 1]; see `model.sdc_matrix`.
         frame: "heading" or "hover", see `LinearMPC`.
-        velocity_reference: "heading" or "attitude", see `LinearMPC`.
+        velocity_reference: "heading" or "attitude", see `SdcNmpc`.
 
     Raises:
         ValueError: If an option is not allowed.
@@ -209,7 +209,7 @@ class Lqr(Sdre):
     Args:
         task: What is known of the flight.
         frame: "heading" or "hover", see `LinearMPC`.
-        velocity_reference: "heading" or "attitude", see `LinearMPC`; "attitude" costs up to 3 times less.
+        velocity_reference: "heading" or "attitude", see `SdcNmpc`; "attitude" costs up to 3 times less.
 
     Raises:
         ValueError: If an option is not allowed.

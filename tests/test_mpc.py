@@ -198,7 +198,7 @@ def test_position_box_is_kept_at_any_heading(flavour):
         (lambda: LinearMPC(TASK, 0), "horizon"),
         (lambda: LinearMPC(TASK, solver="qpoases"), "'structured', 'osqp'"),
         (lambda: LinearMPC(TASK, frame="body"), "'heading', 'hover'"),
-        (lambda: LinearMPC(TASK, velocity_reference="x"), "'heading', 'attitude'"),
+        (lambda: LinearMPC(TASK, velocity_reference="x"), "'level', 'heading', 'attitude'"),
         (lambda: LinearMPC(TASK, soft_weight=-1.0), "soft_weight"),
         (lambda: LinearMPC(TASK, estimator_gain=0.0), "estimator_gain"),
         (lambda: LinearMPC(TASK, iteration_limit=-1), "iteration_limit"),

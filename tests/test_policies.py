@@ -124,7 +124,7 @@ def test_a_wrapper_that_changes_the_action_box_is_refused():
 def test_an_option_that_mpcs_share_has_one_default():
     linear, *others = (policy_options(name) for name in ("lmpc", "sdc-nmpc", "nmpc"))
     for other in others:
-        shared = (linear.keys() & other.keys()) - {"velocity_reference"}  # lmpc alone gains by "attitude"
+        shared = (linear.keys() & other.keys()) - {"velocity_reference"}  # its model alone has level axes
         assert len(shared) == 13
         assert [linear[name] for name in shared] == [other[name] for name in shared]
 
