@@ -63,7 +63,7 @@ def entry_of(compiled: Function) -> Function:
 
 def _kept() -> str:
     """What one compiles and how long it is good for, as the first call finds it."""
-    what = "for the first use of this environment or policy, 5 to 20 s each"
+    what = "for the first use of this environment or policy, 5 to 20 s of one core each"
     if KernelCache is None or folder() is None:
         return f"{what}; nothing can be kept, so that each process compiles anew"
     return f"{what}; kept until their code changes"
