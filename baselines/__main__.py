@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from .errors import MissingPackageError
+from .interruptions import exit_code, remembered
 from .options import (
     BenchmarkOptions,
     CertifyOptions,
@@ -29,8 +30,6 @@ from .streams import quiet_pipe, take_streams
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-_INTERRUPTED = 130  # as the shell names the signal
 
 
 class Command(NamedTuple):
@@ -129,14 +128,14 @@ def make_parser() -> Parser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; the exit code: 0, or 2 if the input was bad, 130 if interrupted.
+    """Run one command; the exit code: 0, or 2 if the input was bad, 130 if interrupted, 143 if terminated.
 
     Modules of the current folder can be named, as `mypolicy:make`.
     """
     if not take_streams():
         print("quad-envs: error: standard output is closed; > /dev/null prints nowhere", file=sys.stderr)
         return 2
-    with quiet_pipe(), _importable_here():
+    with quiet_pipe(), _importable_here(), remembered(terminate=True):
         try:
             return _run(list(sys.argv[1:] if arguments is None else arguments))
         except BrokenPipeError:
@@ -146,9 +145,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 raise
             print(f"quad-envs: error: {_one_line(error)}", file=sys.stderr)
             return 2
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as interruption:
             print("quad-envs: interrupted", file=sys.stderr)
-            return _INTERRUPTED
+            return exit_code(interruption)
 
 
 def _run(given: list[str]) -> int:

@@ -16,6 +16,7 @@ from typing import Any
 
 from quad_envs.names import shortened, unknown_name
 
+from .interruptions import exit_code, raise_lost
 from .options import BenchmarkOptions, EvaluateOptions, ListOptions, read_assignments
 
 _FAILED = 1  # a policy from outside broke off
@@ -204,6 +205,7 @@ def benchmark_suite(options: BenchmarkOptions) -> int:
     def on_unit(count: int, total: int) -> None:
         nonlocal finished
         finished = count
+        raise_lost()
 
     order = Order(
         options.engine,
@@ -217,9 +219,9 @@ def benchmark_suite(options: BenchmarkOptions) -> int:
     with plain_warnings():
         try:
             results = fly_suite(suite, {}, out, order)
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as interruption:
             say(f"interrupted; {finished} units are stored. Resume with: {_resume(options, out)}")
-            return 130
+            return exit_code(interruption)
         finally:
             watcher.close()
     print(json.dumps(results.to_dict(), indent=1, allow_nan=False) if options.json else results)

@@ -8,10 +8,11 @@ from pathlib import Path
 
 from .commands import plain_warnings, say
 from .errors import TrainingError
+from .interruptions import exit_code
 from .options import TrainOptions, read_assignments
 from .results import plain_json
 
-_DIVERGED, _INTERRUPTED = 1, 130
+_DIVERGED = 1
 
 
 def train_one(options: TrainOptions) -> int:
@@ -42,15 +43,15 @@ def train_one(options: TrainOptions) -> int:
         except TrainingError as error:
             say(f"quad-envs: {error}")
             return _DIVERGED
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as interruption:
             display.close()
             if not (out / "policy.json").exists():
-                say("interrupted before the first policy; nothing is saved")
+                say("interrupted before the first policy, nothing is saved: the same command begins anew")
             elif resumable(options.algorithm):
                 say(f"interrupted; the policy is saved. Resume with: {resume_command(options, out)}")
             else:
                 say(f"interrupted; the best policy is in {out}. {options.algorithm} cannot be resumed")
-            return _INTERRUPTED
+            return exit_code(interruption)
         finally:
             display.close()
     if options.json:

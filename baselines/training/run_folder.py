@@ -17,7 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ..errors import ResultsError
+from ..errors import CheckpointError, ResultsError
 from ..results import plain_json, provenance, read_json, write_atomic, write_csv
 from .checkpoints import DESCRIPTION, WEIGHTS, load_checkpoint, save_checkpoint
 from .held_out import Point, read_point
@@ -58,7 +58,7 @@ class RunFolder:
                     f"{str(self.path)!r} holds a {foreign[0]} that no training has written; choose another "
                     "folder, or move it away"
                 )
-        elif not fresh:
+        elif not fresh and (self.last.exists() or (self.path / WEIGHTS).exists()):
             raise ResultsError(
                 f"{str(self.path)!r} holds a training of {found['algorithm']} on {found['env_id']}, seed "
                 f"{found['seed']}: go on with it (--resume), discard it (--fresh), or choose another folder"
@@ -89,6 +89,11 @@ class RunFolder:
             raise ResultsError(
                 f"{str(self.path)!r} holds another training: its {name} is {json.dumps(found.get(name))}, "
                 f"asked for is {json.dumps(asked.get(name))}; give the same, or choose another folder"
+            )
+        if not self.last.exists():
+            raise CheckpointError(
+                f"the training in {str(self.path)!r} was interrupted before its first policy, so there is "
+                "nothing to go on from: the same command without --resume begins anew"
             )
         network, described = load_checkpoint(self.last)
         return network, described, self.read_curve()

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import CheckpointError, ResultsError, TrainingError
+from ..interruptions import held, raise_lost, remembered
 from ..results import locked
 from .algorithms import generator_of, require_resumable
 from .clock import TrainingClock
@@ -106,7 +107,7 @@ def train(
     plan = make_plan(env_id, algorithm, seed, seconds, steps, env_kwargs, hyper, start_from)
     path = default_folder(env_id, algorithm, seed) if out is None else Path(out)
     held_out = HeldOutFlights(env_id, plan.env_kwargs)
-    with locked(path):
+    with remembered(), locked(path):
         folder = plan.folder(path)
         if resume:
             start = _resume(folder, plan)
@@ -179,6 +180,7 @@ class _Run:
     def _turn(self, updates: Iterator[tuple[Any, Network]]) -> None:
         """Update after update."""
         while True:
+            raise_lost()
             try:
                 with self.clock.running():
                     found = next(updates, None)
@@ -212,6 +214,12 @@ class _Run:
         """Evaluate the network, and save it."""
         assert self.network is not None
         point = self.held_out.judge(self.network, self.clock.seconds, self.progress)
+        with held():  # what is judged is saved, or neither
+            self._take(point)
+
+    def _take(self, point: Point) -> None:
+        """Save a network that was judged, and tell of it."""
+        assert self.network is not None
         self._judged, self._next = point.cpu_seconds, self.share() + 1.0 / _EVALUATIONS
         self.curve.append(point)
         best = better(point, self.best, self.limit)

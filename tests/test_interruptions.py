@@ -1,0 +1,215 @@
+"""Ctrl-C and SIGTERM end a command wherever they arrive: what was reached is saved, nobody stays behind."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import threading
+import time
+
+import pytest
+from processes import start_command
+from stub_training import (
+    stub,
+    stubs,  # noqa: F401  puts the stubs into the registry
+)
+
+from baselines.__main__ import COMMANDS, main
+from baselines.interruptions import Terminated, exit_code, held, raise_lost, remembered
+from baselines.training.checkpoints import load_checkpoint
+from baselines.training.runs import train
+
+HELIX = "quad/HelixTracking-v0"
+
+
+def press(number=signal.SIGINT):
+    os.kill(os.getpid(), number)
+    time.sleep(0.01)  # until Python has run the handler
+
+
+def swallow():
+    """Press Ctrl-C where nobody can catch what it raises: in a callback from C."""
+    ctypes.CFUNCTYPE(None)(press)()
+
+
+def test_an_interruption_that_nobody_could_catch_is_raised_where_it_is_asked_for(capsys):
+    with pytest.raises(KeyboardInterrupt), remembered():
+        swallow()
+        raise_lost()
+    assert capsys.readouterr().err == ""  # no "Exception ignored in"
+    raise_lost()  # it is dealt with
+
+
+def test_an_interruption_is_raised_at_once_where_it_can_be():
+    reached = []
+    with pytest.raises(KeyboardInterrupt), remembered():
+        press()
+        reached.append(1)
+    assert not reached
+
+
+def test_a_held_block_is_done_as_a_whole():
+    done = []
+    with pytest.raises(Terminated), remembered(terminate=True):
+        with held():
+            with held():
+                press(signal.SIGTERM)
+            done.append(1)
+        done.append(2)
+    assert done == [1]
+
+
+def test_handlers_of_others_and_ignored_signals_are_left_alone():
+    heard = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
+    try:
+        with remembered():
+            press()
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        with remembered():
+            press()
+            assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert heard == [signal.SIGINT]
+
+
+def test_the_handlers_are_as_before_afterwards_and_other_threads_have_none():
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    with remembered(terminate=True), remembered():
+        assert signal.getsignal(signal.SIGTERM) is not before[1]
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+    def body():
+        with remembered():
+            seen.append(signal.getsignal(signal.SIGINT))
+
+    seen = []
+    thread = threading.Thread(target=body)
+    thread.start()
+    thread.join()
+    assert seen == [before[0]]
+
+
+def pressing(at, how):
+    """The stub, in which `how` happens in an update."""
+
+    def learn(task_options, options, seed, spent, start=None):
+        for found in stub(task_options, options, seed, spent, start):
+            if found[0].update == at:
+                how()
+            yield found
+
+    return learn
+
+
+@pytest.fixture
+def learner(monkeypatch):
+    """Puts another generator behind the stub."""
+
+    def put(learn):
+        monkeypatch.setattr("baselines.training.runs.generator_of", lambda name: learn)
+
+    return put
+
+
+@pytest.mark.parametrize("how", [press, swallow])
+def test_a_training_ends_at_ctrl_c_even_where_it_is_written_off(tmp_path, learner, how):
+    learner(pressing(3, how))
+    with pytest.raises(KeyboardInterrupt):
+        train(HELIX, "stub", steps=5000, out=tmp_path / "run")
+    load_checkpoint(tmp_path / "run")
+    load_checkpoint(tmp_path / "run" / "last")
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["Ctrl-C", "SIGTERM"]
+)
+def test_both_signals_save_the_run_and_end_with_the_code_of_the_shell(
+    tmp_path, capsys, learner, number, code
+):
+    learner(pressing(3, lambda: press(number)))
+    arguments = ["train", HELIX, "stub", "--steps", "5000", "--out", str(tmp_path / "run")]
+    assert main(arguments) == code
+    said = capsys.readouterr().err
+    assert "the policy is saved. Resume with" in said and "Traceback" not in said
+    learner(stub)
+    assert main([*arguments, "--resume"]) == 0
+
+
+def test_a_run_that_ended_before_its_first_policy_begins_anew(tmp_path, capsys, learner):
+    learner(pressing(1, press))
+    arguments = ["train", HELIX, "stub", "--steps", "500", "--out", str(tmp_path / "run")]
+    assert main(arguments) == 130
+    assert "interrupted before the first policy" in capsys.readouterr().err
+    learner(stub)
+    assert main([*arguments, "--resume"]) == 2
+    assert "interrupted before its first policy" in capsys.readouterr().err
+    assert main(arguments) == 0  # there is nothing that --fresh would discard
+
+
+def test_a_policy_that_was_judged_is_saved_before_the_run_ends(tmp_path, monkeypatch):
+    from baselines.training import run_folder
+
+    save = run_folder.RunFolder.save_best
+
+    def save_slowly(self, network, about):
+        press()
+        save(self, network, about)
+
+    monkeypatch.setattr(run_folder.RunFolder, "save_best", save_slowly)
+    with pytest.raises(KeyboardInterrupt):
+        train(HELIX, "stub", steps=5000, out=tmp_path / "run")
+    assert len((tmp_path / "run" / "curve.csv").read_text().splitlines()) == 2
+    load_checkpoint(tmp_path / "run" / "last")
+
+
+def test_commands_end_with_one_line_at_both_signals(capsys, monkeypatch):
+    for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 143)):
+        monkeypatch.setitem(
+            COMMANDS, "list", COMMANDS["list"]._replace(run=lambda options, number=number: press(number))
+        )
+        assert main(["list"]) == code
+        assert capsys.readouterr() == ("", "quad-envs: interrupted\n")
+
+
+def test_the_codes_are_those_of_the_shell():
+    assert exit_code(KeyboardInterrupt()) == 128 + signal.SIGINT
+    assert exit_code(Terminated()) == 128 + signal.SIGTERM
+
+
+def children(process):
+    """Processes whose parent is this one."""
+    with open(f"/proc/{process.pid}/task/{process.pid}/children") as file:
+        return [int(number) for number in file.read().split()]
+
+
+def alive(number):
+    try:
+        with open(f"/proc/{number}/stat") as file:
+            return file.read().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_no_process_stays_behind_a_sweep_that_was_ended(tmp_path, number, code):
+    suite, out = tmp_path / "long.toml", tmp_path / "run"
+    suite.write_text(
+        'envs = ["quad/HelixTracking-v0"]\npolicies = ["random", "hover", "lqr"]\nepisodes = 2000\n'
+    )
+    with start_command("benchmark", suite, "--out", out, "--jobs", "2") as process:
+        while not list(out.glob("cells/*.json")) and process.poll() is None:
+            time.sleep(0.05)
+        workers = children(process)
+        process.send_signal(number)
+        printed, said = process.communicate(timeout=60)
+    assert process.returncode == code and printed == "" and "Resume with" in said
+    assert workers
+    for _ in range(100):
+        if not any(map(alive, workers)):
+            break
+        time.sleep(0.1)
+    assert not any(map(alive, workers))
