@@ -20,15 +20,17 @@ _MEMORY = 16 * _GIB  # of a machine that does not say
 class Bound(NamedTuple):
     """What a number may be, and why."""
 
-    least: float
-    most: float
+    least: float = 0.0
+    most: float = math.inf  # infinite: any finite number
     unit: str = ""
     why: str = ""  # a clause, for the message
     open: bool = False  # whether `least` itself is not allowed
 
     def __str__(self) -> str:
-        low = f"a finite number > {self.least:g} and" if self.open else f"a number from {self.least:g}"
-        return f"{low} {'<=' if self.open else 'to'} {self.most:g} {self.unit}".rstrip()
+        if self.most == math.inf:
+            return f"a finite number {'>' if self.open else '>='} {self.least:g} {self.unit}".rstrip()
+        low = f"a finite number > {self.least:g} and <=" if self.open else f"a number from {self.least:g} to"
+        return f"{low} {self.most:g} {self.unit}".rstrip()
 
 
 def require_number(what: str, value: Any, bound: Bound) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -89,6 +91,9 @@ def test_the_bounds_of_a_number_belong_to_it():
         with pytest.raises(ValueError, match=r"x must be .* 0 .* 2 m, got 2.1; why"):
             require_number("x", 2.1, bound)
     require_number("x", 0.0, Bound(0.0, 1.0))
+    with pytest.raises(ValueError, match="x must be a finite number > 0 m, got inf"):
+        require_number("x", math.inf, Bound(unit="m", open=True))
+    gym.make(HELIX, lost_distance=1e308)  # never lost
     with pytest.raises(ValueError, match="got 0"):
         require_number("x", 0.0, Bound(0.0, 1.0, open=True))
     require_whole("n", np.int32(3), 3, 3)
@@ -114,7 +119,7 @@ def test_the_bounds_of_a_number_belong_to_it():
         *(("rate_limit", value) for value in (0.0, 1e-300)),
         *(("Q", value) for value in (-1.0, 1e30)),
         *(("R", value) for value in (0.0, 1e-30, 1e30)),
-        ("lost_distance", 1e300),
+        ("lost_distance", math.inf),
     ],
 )
 def test_parameters_that_no_vehicle_has_are_refused_by_name(name, value):

@@ -23,7 +23,7 @@ MOST_STEPS = 1_000_000  # control periods of an episode; its tables are made at 
 _MOST_SUBSTEPS = 1000
 MOST_PREVIEW = 10_000  # stages
 _PERIOD = Bound(1e-5, 1.0, "s", "slower, no controller holds a quadrotor; faster, times are rounding")
-POSITIVE = Bound(0.0, 1e9, open=True)
+POSITIVE = Bound(open=True)
 NOISE = Bound(0.0, 1e3, "m, m/s, rad or rad/s", "beyond, a measurement says nothing of the vehicle")
 _RK4_REAL = 2.5  # |h lambda| up to which RK4 follows a decay; its limit is 2.785
 RANDOMIZABLE = ("mass", "inertia", "arm", "kappa", "rotor_rate", "drag")
