@@ -38,4 +38,5 @@ def test_every_file_that_is_no_code_is_named_as_data():
 def test_the_citation_names_this_version():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
-    assert f"\nversion: {project['version']}\n" in citation and f"\nlicense: {project['license']}\n" in citation
+    for name in ("version", "license"):
+        assert f"\n{name}: {project[name]}\n" in citation
