@@ -93,12 +93,23 @@ class Progress:
 
 
 class SweepProgress:
-    """Follows a sweep: compiles before the first unit, then shows each row as soon as it is flown."""
+    """Follows a sweep: shows what is trained, compiles before the first unit flies, and shows each row."""
 
     def __init__(self) -> None:
+        self._train: Progress | None = None
         self._fly: Progress | None = None
         self._left = 0  # units
         self._all = self._flown = 0.0  # price of what is to be flown, and of what is
+
+    def trained(self, finished: int, total: int) -> None:
+        """So many of the networks are there; each takes about as long as another."""
+        if self._train is None:
+            self._train = Progress("train", total)
+            self._train.write(f"train: {total} networks")
+            return
+        self._train.write(f"train: {finished} of {total} are there; {self._train.move(finished, total)}")
+        if finished == total:
+            self._train.close()
 
     def ready(self, left: Sequence[Unit]) -> None:
         """All is checked, and networks are trained: these units are going to fly."""
@@ -124,8 +135,9 @@ class SweepProgress:
 
     def close(self) -> None:
         """Take the bar away, also where the sweep was interrupted."""
-        if self._fly is not None:
-            self._fly.close()
+        for progress in (self._train, self._fly):
+            if progress is not None:
+                progress.close()
 
 
 def compile_for(units: Sequence[Unit]) -> None:

@@ -38,6 +38,9 @@ REPORTED = 2  # flights of each unit that are saved for the report where not all
 class Watcher(Protocol):
     """Who follows a sweep."""
 
+    def trained(self, finished: int, total: int) -> None:
+        """So many of the networks are there; called before the first, too, if there are any."""
+
     def ready(self, left: Sequence[Unit]) -> None:
         """All is checked, and networks are trained: these units are going to fly."""
 
@@ -94,14 +97,19 @@ class Sweep:
         report(self.done, total)
         for number in self.failed:
             self._warn(number)
+        watcher = self.order.watcher
+        if watcher is not None and self.to_train:
+            watcher.trained(0, len(self.to_train))
         for number, training in run_units(train_unit, self.to_train, engine, jobs):
             self.trained[number] = training
             report(self.done, total)
+            if watcher is not None:
+                watcher.trained(len(self.trained), len(self.to_train))
         if jobs == 1:  # in parallel the long ones would be left over in the end
             places = {unit.env.title: i for i, unit in reversed(list(enumerate(left)))}
             left.sort(key=lambda unit: (places[unit.env.title], price(unit)))
-        if self.order.watcher is not None:
-            self.order.watcher.ready(left)
+        if watcher is not None:
+            watcher.ready(left)
         for number, cell in run_units(fly_unit, left, engine, jobs):
             if "failure" in cell:
                 self.failed[number] = cell["failure"]
@@ -111,8 +119,8 @@ class Sweep:
                     write_json(self.folder / "cells" / self.units[number].file_name, cell)
                 self.flown[number] = cell
             report(self.done, total)
-            if self.order.watcher is not None and number in self.flown:
-                self.order.watcher.flown(self.units[number], Evaluation.from_plain(cell["found"]))
+            if watcher is not None and number in self.flown:
+                watcher.flown(self.units[number], Evaluation.from_plain(cell["found"]))
 
     def _warn(self, number: int) -> None:
         """Say at once, and not only in the end, that one of several units broke off."""

@@ -6,7 +6,7 @@ import pytest
 
 from baselines.__main__ import main
 from baselines.policy import TRACKING_POLICIES
-from baselines.stages import compile_for, price, said_left, said_seconds
+from baselines.stages import SweepProgress, compile_for, price, said_left, said_seconds
 from baselines.suite import PolicyChoice
 from baselines.suite_files import load_suite
 from baselines.sweep import Order, Sweep
@@ -92,3 +92,19 @@ def test_the_time_left_follows_the_work_and_not_the_count():
     assert said_left(10.0, 1.0, 4.0) == "about 30 s left"
     assert said_left(0.0, 0.0, 4.0) == ""
     assert said_left(12.0, 4.0, 4.0) == "took 12 s"
+
+
+def test_networks_that_are_trained_are_counted_with_the_time_left(tmp_path, capsys):
+    suite = {
+        "name": "learned",
+        "episodes": 1,
+        "envs": [{"id": "quad/Regulation-v0", "kwargs": {"time_limit": 0.5}}],
+        "policies": ["hover", {"name": "dagger", "train": {"seeds": [0, 1], "steps": 500}}],
+    }
+    sweep = Sweep(load_suite(suite), {}, {}, tmp_path, Order(watcher=SweepProgress()))
+    sweep.go()
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == "train: 2 networks"
+    assert re.fullmatch(r"train: 1 of 2 are there; about \d+ s left", said[1])
+    assert re.fullmatch(r"train: 2 of 2 are there; took \d+ s", said[2])
+    assert said[3].startswith("compile: hover; ") and len(said) == 7
