@@ -21,12 +21,14 @@ from .mpc import (
     MpcOptions,
     Problem,
     SolverName,
-    VelocityAxes,
     default_tilt,
+    require_choice,
 )
 from .mpc_kernels import MpcData, Scratch, begin_row, carve, end_row, hold_trim, left_model, solve_within_tilt
 from .ocp import IntArray
 from .solvers.structured import ITERATION_LIMIT, Workspace
+
+LevelReference = Literal["level", "heading", "attitude"]
 
 
 @kernel
@@ -107,7 +109,7 @@ class LinearMPC(Mpc):
         *,
         solver: SolverName = "structured",
         frame: Frame = "heading",
-        velocity_reference: VelocityAxes = "level",
+        velocity_reference: LevelReference = "level",
         soft_weight: float = SOFT_WEIGHT,
         margin: float = 0.02,
         reject_disturbance: bool = False,
@@ -119,6 +121,7 @@ class LinearMPC(Mpc):
         terminal: ArrayLike = 1.0,
         R_rate: ArrayLike | None = None,
     ) -> None:
+        require_choice("velocity_reference", velocity_reference, LevelReference)
         options = MpcOptions(
             solver,
             frame,

@@ -42,7 +42,7 @@ from .weights import change_weight, require_turnable, terminal_weight, weight_ma
 SolverName = Literal["structured", "osqp"]
 Frame = Literal["heading", "hover"]
 VelocityReference = Literal["heading", "attitude"]
-VelocityAxes = Literal["level", "heading", "attitude"]
+VelocityAxes = Literal["level", "present", "heading", "attitude"]
 TILT_WEIGHT = 1e4  # per rad, of the rows that keep a plan inside its model; 1e3 gives way to heavy positions
 PLAN_TILT = 0.8  # rad, of models linear in the attitude
 EXACT_TILT = 1.0  # rad, of the exact model
@@ -84,7 +84,6 @@ class MpcOptions:
     def __post_init__(self) -> None:
         require_choice("solver", self.solver, SolverName)
         require_choice("frame", self.frame, Frame)
-        require_choice("velocity_reference", self.velocity_reference, VelocityAxes)
         if not self.soft_weight >= 0.0:
             raise ValueError(
                 f"soft_weight must be >= 0 (math.inf for hard rows), got {shown(self.soft_weight)}"
@@ -193,8 +192,9 @@ def mpc_data(task: BaseTask, horizon: int, options: MpcOptions) -> MpcData:
         lag=rotor_lag(task),
         gain=estimator_gain(task, options),
         heading=options.frame == "heading",
-        attitude=options.frame == "heading" and options.velocity_reference == "attitude",
+        attitude=options.frame == "heading" and options.velocity_reference in ("attitude", "present"),
         level=options.frame == "heading" and options.velocity_reference == "level",
+        present=options.frame == "heading" and options.velocity_reference == "present",
         kinematics=False,
         iteration_limit=int(options.iteration_limit),
         plan_tilt=float(options.plan_tilt) if len(tilted.normals) else math.inf,

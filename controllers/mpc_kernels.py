@@ -21,6 +21,7 @@ from .disturbance import ESTIMATOR_SCRATCH, N_DISTURBANCE, feed_forward, remembe
 from .fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXED_WEIGHT, limit_command
 from .linalg import copy
 from .ocp import IntArray
+from .present_axes import body_outputs
 from .riccati import DARE_SCRATCH
 from .solvers.active_set import INFEASIBLE, OPTIMAL
 from .solvers.structured import Workspace, solve_structured
@@ -58,6 +59,7 @@ class MpcData(NamedTuple):
     heading: bool  # whether the problem is posed at the present position and heading
     attitude: bool  # whether v_ref is turned into the present body axes
     level: bool  # whether the model's velocity stands in level axes, as v_ref, instead of in body axes
+    present: bool  # whether it stands in those of the present attitude, which do not turn along a plan
     kinematics: bool  # whether the model turns body rates into Euler rates at the present attitude
     iteration_limit: int
     plan_tilt: float  # rad, of the plan's own rows, inf for none
@@ -376,6 +378,8 @@ def begin_row(
     copy_vector(data.weight, s.weight)
     if data.heading:
         turn_rows(plant, data.axis, data.normal, s.normals, s.row_lower, s.row_upper)
+    if data.level or data.present:
+        body_outputs(plant, data.level, data.normal, s.normals, s.row_lower, s.row_upper)
 
 
 @kernel

@@ -25,7 +25,6 @@ from .mpc import (
     MpcOptions,
     Problem,
     SolverName,
-    VelocityReference,
     default_tilt,
     require_choice,
 )
@@ -42,10 +41,12 @@ from .mpc_kernels import (
     solve_within_tilt,
 )
 from .ocp import IntArray
+from .present_axes import pair_in_present_axes, stop_turning
 from .riccati import solve_dare
 from .solvers.structured import ITERATION_LIMIT, Workspace
 
 TerminalWeight = Literal["hover", "sdre"]
+PresentReference = Literal["present", "heading", "attitude"]
 _TILT_LIMIT = 1.4  # rad, of roll and pitch of the states at which the model is taken again
 
 
@@ -74,17 +75,19 @@ def hold_heading(r: Array, x: Array, A_c: Array, dt: float, c: Array) -> None:
 
 
 @kernel
-def freeze_model(alpha: float, sdre_weight: bool, data: MpcData, s: Scratch) -> bool:
+def freeze_model(alpha: float, present: bool, sdre_weight: bool, data: MpcData, s: Scratch) -> bool:
     """The pair at x_0 for the whole horizon, and the terminal weight.
 
     Returns:
         Whether the terminal weight solves the Riccati equation of the pair.
     """
     sdc_matrix(s.x_0, alpha, data.coefficients, s.A_c)
+    if present:
+        stop_turning(s.A_c)
     zero_order_hold(s.A_c, data.B_c, data.dt, s.A[0], s.B[0], s.square)
     copy_vector(s.x_0, s.points[0])
     hold_trim(s.A[:1], s.trim, s.c)
-    for i in range(s.c.shape[0]):
+    for i in range(0 if present else s.c.shape[0]):
         hold_heading(s.r[i], s.x_0, s.A_c, data.dt, s.c[i])
     if sdre_weight and solve_dare(s.A[0], s.B[0], data.Q[0], data.R, s.P, s.square) > 0:
         return True
@@ -93,19 +96,29 @@ def freeze_model(alpha: float, sdre_weight: bool, data: MpcData, s: Scratch) -> 
 
 
 @kernel
-def relinearise(u: Array, alpha: float, data: MpcData, s: Scratch) -> None:
+def relinearise(u: Array, alpha: float, present: bool, data: MpcData, s: Scratch) -> None:
     """The N pairs met along x_{i+1} = A(x_i) x_i + B(x_i) u_i + c_i under the plan u; memoryless."""
     x, x_next = s.square[3, 0], s.square[3, 1]
+    R, work = s.square[8, :3], s.square[8, 3:9]
+    B_c = s.square[9].reshape(-1)[: data.B_c.size].reshape(data.B_c.shape)
+    copy(data.B_c, B_c)
+    sdc_matrix(s.x_0, alpha, data.coefficients, s.A_c)
+    for a in range(3):
+        copy_vector(s.A_c[a, 3:6], R[a, :3])
     copy_vector(s.x_0, x)
     for i in range(u.shape[0]):
         copy_vector(x, s.points[i])
         yaw = x[8]
-        x[8] -= s.r[i, 8] - s.r[0, 8]  # velocities do not turn with the heading of the reference
+        if not present:
+            x[8] -= s.r[i, 8] - s.r[0, 8]  # velocities do not turn with the heading of the reference
         sdc_matrix(x, alpha, data.coefficients, s.A_c)
+        if present:
+            pair_in_present_axes(R, data.B_c, s.A_c, B_c, work)
         x[8] = yaw
-        zero_order_hold(s.A_c, data.B_c, data.dt, s.A[i], s.B[i], s.square)
+        zero_order_hold(s.A_c, B_c, data.dt, s.A[i], s.B[i], s.square)
         hold_trim(s.A[i : i + 1], s.trim, s.c[i : i + 1])
-        hold_heading(s.r[i], x, s.A_c, data.dt, s.c[i])
+        if not present:
+            hold_heading(s.r[i], x, s.A_c, data.dt, s.c[i])
         for a in range(N_STATE):
             total = s.c[i, a]
             for b in range(N_STATE):
@@ -140,6 +153,7 @@ def _decide_rows(
     report: IntArray,
     which: IntArray | None,
     alpha: float,
+    present: bool,
     relinearisations: int,
     at_need: bool,
     sdre_weight: bool,
@@ -158,11 +172,11 @@ def _decide_rows(
     for j in range(plants.shape[0]):
         begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
         worst, iterations = 0, 0
-        stationary = freeze_model(alpha, sdre_weight, data, s)
+        stationary = freeze_model(alpha, present, sdre_weight, data, s)
         for k in range(1 + relinearisations):
             pairs = 1
             if k > 0:
-                relinearise(ws.u, alpha, data, s)
+                relinearise(ws.u, alpha, present, data, s)
                 stationary, pairs = False, N
             has_plan = memories[j, 0] > 0.0
             level, count = solve_within_tilt(
@@ -194,8 +208,10 @@ class SdcNmpc(Mpc):
         terminal_weight: "hover": P of the hover model; "sdre": P of the present pair.
         solver: See `LinearMPC`, as the options that follow.
         frame: "heading" or "hover".
-        velocity_reference: How v_ref is turned before it is compared with V_B, in frame "heading": by the
-            present "heading", or by the whole present "attitude".
+        velocity_reference: What is compared with v_ref, in frame "heading". "present": the velocity in axes
+            of the present attitude (`present_axes.py`), into which v_ref is turned. "heading", "attitude":
+            V_B, which turns along the plan, with v_ref turned by the present heading, or by the whole present
+            attitude. None: "present", or with another alpha than 1 "heading".
         soft_weight: Exact penalty per unit of a state row; inf makes the rows hard.
         margin: What the plan keeps from each state limit, in its SI unit: cover for the unmodelled rotor lag.
         reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
@@ -224,7 +240,7 @@ class SdcNmpc(Mpc):
         *,
         solver: SolverName = "structured",
         frame: Frame = "heading",
-        velocity_reference: VelocityReference = "heading",
+        velocity_reference: PresentReference | None = None,
         soft_weight: float = SOFT_WEIGHT,
         margin: float = 0.02,
         reject_disturbance: bool = False,
@@ -245,7 +261,14 @@ class SdcNmpc(Mpc):
         else:
             require_whole("relinearisations, if not 'auto',", relinearisations, 0, MOST_PASSES)
             passes = int(relinearisations)
-        require_choice("velocity_reference", velocity_reference, VelocityReference)
+        if velocity_reference is None:
+            velocity_reference = "present" if frame == "heading" and alpha == 1.0 else "heading"
+        require_choice("velocity_reference", velocity_reference, PresentReference)
+        if velocity_reference == "present" and alpha != 1.0:
+            raise ValueError(
+                f"velocity_reference='present' leaves out -Omega x V_B, which alpha = {alpha!r} splits: "
+                "take alpha=1, or 'heading' or 'attitude'"
+            )
         require_choice("terminal_weight", terminal_weight, TerminalWeight)
         options = MpcOptions(
             solver,
@@ -270,6 +293,7 @@ class SdcNmpc(Mpc):
         super().__init__(task, horizon, options, pairs=horizon if passes else 1, guess=False)
         self._data = self._data._replace(kinematics=True)
         self.alpha = float(alpha)
+        self._present = self._data.present
         self.relinearisations, self._at_need = passes, relinearisations == "auto"
         self.terminal_weight = terminal_weight
 
@@ -279,6 +303,7 @@ class SdcNmpc(Mpc):
         constants = (
             which,
             self.alpha,
+            self._present,
             self.relinearisations,
             self._at_need,
             sdre_weight,
@@ -292,9 +317,11 @@ class SdcNmpc(Mpc):
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
         stationary, pairs = False, 1
         if number == 0:
-            stationary = freeze_model(self.alpha, self.terminal_weight == "sdre", self._data, s)
+            stationary = freeze_model(
+                self.alpha, self._present, self.terminal_weight == "sdre", self._data, s
+            )
         else:
-            relinearise(ws.u, self.alpha, self._data, s)
+            relinearise(ws.u, self.alpha, self._present, self._data, s)
             pairs = self.horizon
         return Problem(s.A[:pairs], s.B[:pairs], self._data.Q, s.P, stationary, s.r)
 
