@@ -116,7 +116,7 @@ def test_the_ellipse_of_a_shape_satisfies_its_equation():
 
 def test_without_matplotlib_the_message_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(MissingPackageError, match=r"quad-envs\[report\]"), house_style():
+    with pytest.raises(MissingPackageError, match=r'-e "\.\[report\]"'), house_style():
         pass
 
 
