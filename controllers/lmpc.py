@@ -21,10 +21,20 @@ from .mpc import (
     MpcOptions,
     Problem,
     SolverName,
+    default_rate,
     default_tilt,
     require_choice,
 )
-from .mpc_kernels import MpcData, Scratch, begin_row, carve, end_row, hold_trim, left_model, solve_within_tilt
+from .mpc_kernels import (
+    MpcData,
+    Scratch,
+    begin_row,
+    carve,
+    end_row,
+    hold_trim,
+    left_model,
+    solve_within_model,
+)
 from .ocp import IntArray
 from .solvers.structured import ITERATION_LIMIT, Workspace
 
@@ -60,7 +70,7 @@ def _decide_rows(
         begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
         hold_trim(A, s.trim, s.c)
         has_plan = memories[j, 0] > 0.0
-        level, iterations = solve_within_tilt(A, B, data.Q, data.P, stationary, s.r, has_plan, data, s, ws)
+        level, iterations = solve_within_model(A, B, data.Q, data.P, stationary, s.r, has_plan, data, s, ws)
         end_row(level, plants[j], lasts[j], disturbances[j], memories[j], data, s, ws.u, commands[j], kept[j])
         left = left_model(level, s.x_0, ws.x, s.points, data.model_tilt, data.first_angle)
         report[0, j], report[1, j], report[2, j] = level, iterations, left
@@ -94,6 +104,8 @@ class LinearMPC(Mpc):
         R: Weight of the rotor forces, a number, the diagonal (4,) or a matrix; the reward's by default.
         plan_tilt: Largest roll and pitch of a plan, rad, besides the task's limit: where the model holds.
             None stands for 0.8 in frame "heading" and no such limit in frame "hover".
+        plan_rate: Largest roll and pitch rate of a plan, rad/s, half of it in yaw, likewise; by default
+            0.3 rad a sample.
         terminal: Factor of P, the weight of x_N, or a matrix (12, 12) in its place.
         R_rate: Weight of the changes of the forces from sample to sample, the first one against the command
             applied before; a number, the diagonal (4,) or a matrix. None: changes cost nothing.
@@ -118,6 +130,7 @@ class LinearMPC(Mpc):
         Q: ArrayLike | None = None,
         R: ArrayLike | None = None,
         plan_tilt: float | None = None,
+        plan_rate: float | None = None,
         terminal: ArrayLike = 1.0,
         R_rate: ArrayLike | None = None,
     ) -> None:
@@ -134,6 +147,7 @@ class LinearMPC(Mpc):
             Q,
             R,
             default_tilt(plan_tilt, PLAN_TILT, frame),
+            default_rate(plan_rate, task.dt, frame),
             terminal,
             R_rate,
         )

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from quad_envs.checks import require_whole
 from quad_envs.names import shown
-from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, VELOCITY, Array, Limits
+from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, RATES, VELOCITY, Array, Limits
 from quad_envs.tasks import BaseTask, Task
 
 from .controller import Decision, as_one_row, as_rows, first_non_finite, raise_non_finite, require_horizon
@@ -28,7 +28,7 @@ from .mpc_kernels import (
     buffer_size,
     carve,
     end_row,
-    leaves_tilt,
+    leaves_bound,
     left_model,
     rotor_lag,
 )
@@ -43,8 +43,10 @@ SolverName = Literal["structured", "osqp"]
 Frame = Literal["heading", "hover"]
 VelocityReference = Literal["heading", "attitude"]
 VelocityAxes = Literal["level", "present", "heading", "attitude"]
-TILT_WEIGHT = 1e4  # per rad, of the rows that keep a plan inside its model; 1e3 gives way to heavy positions
+PLAN_WEIGHT = 1e4  # per rad, rad/s: of rows that keep a plan in its model; 1e3 gives way to heavy positions
 PLAN_TILT = 0.8  # rad, of models linear in the attitude
+PLAN_TURN = 0.3  # rad, of roll and pitch from sample to sample
+YAW_SHARE = 0.5  # of it for yaw: the axes of the problem stay where the heading is now
 EXACT_TILT = 1.0  # rad, of the exact model
 SOFT_WEIGHT = 25.0  # per SI unit: keeps the corridor's limits; from 30 on, 3 m outside walls, some flip
 
@@ -78,6 +80,7 @@ class MpcOptions:
     Q: ArrayLike | None = None  # weight of the state: number, diagonal (12,) or matrix; None: the reward's
     R: ArrayLike | None = None  # weight of the forces: number, diagonal (4,) or matrix; None: the reward's
     plan_tilt: float = math.inf  # rad, largest roll and pitch of a plan, for the sake of its model
+    plan_rate: float = math.inf  # rad/s, largest roll and pitch rate of a plan, half of it in yaw, likewise
     terminal: ArrayLike = 1.0  # factor of P, the weight of x_N, or a matrix (12, 12) in the problem's axes
     R_rate: ArrayLike | None = None  # weight of the changes of the forces, as R; None: none
 
@@ -98,6 +101,11 @@ class MpcOptions:
             )
         if not self.plan_tilt > 0.0:
             raise ValueError(f"plan_tilt must be > 0 rad, got {shown(self.plan_tilt)}; math.inf is no limit")
+            raise ValueError(f"plan_tilt must be > 0 rad, got {self.plan_tilt!r}; math.inf is no limit")
+        if not self.plan_rate > 0.0:
+            raise ValueError(
+                f"plan_rate must be > 0 rad/s, got {shown(self.plan_rate)}; math.inf is no limit"
+            )
         require_whole(
             "iteration_limit (0: one that grows with the problem)", self.iteration_limit, 0, MOST_ITERATIONS
         )
@@ -141,15 +149,31 @@ def default_tilt(plan_tilt: float | None, usual: float, frame: Frame) -> float:
     return usual if frame == "heading" else math.inf
 
 
-def plan_tilt_rows(tilt: float, limits: Limits, horizon: int) -> StateRows:
-    """Rows that keep roll and pitch of a plan where its model holds; none where the task's limit does.
+def default_rate(plan_rate: float | None, dt: float, frame: Frame) -> float:
+    """The rate that a plan keeps to, rad/s: as chosen, else `PLAN_TURN` a sample; cf. `default_tilt`."""
+    if plan_rate is not None:
+        return plan_rate
+    return PLAN_TURN / dt if frame == "heading" else math.inf
 
-    They are soft and stiff: `solve_within_tilt` takes them in only when a plan needs them.
+
+def plan_bound(options: MpcOptions, limits: Limits) -> Array:
+    """Largest magnitude of each state of a plan where its model holds, (12,); inf for none of its own."""
+    bound = np.full(N_STATE, math.inf)
+    if options.plan_tilt < limits.tilt:
+        bound[ATTITUDE][:2] = options.plan_tilt
+    bound[RATES] = options.plan_rate * np.array([1.0, 1.0, YAW_SHARE])
+    return bound
+
+
+def plan_rows(bound: Array, horizon: int) -> StateRows:
+    """Rows that keep a plan where its model holds.
+
+    They are soft and stiff: `solve_within_model` takes them in only when a plan needs them.
     """
-    if tilt >= limits.tilt or tilt == math.inf:
+    bounded = np.isfinite(bound)
+    if not bounded.any():
         return no_rows()
-    bound = np.full(2, tilt)
-    return output_rows(np.eye(N_STATE)[ATTITUDE][:2], -bound, bound, TILT_WEIGHT, horizon)
+    return output_rows(np.eye(N_STATE)[bounded], -bound[bounded], bound[bounded], PLAN_WEIGHT, horizon)
 
 
 def estimator_gain(task: BaseTask, options: MpcOptions) -> Array:
@@ -170,8 +194,9 @@ def mpc_data(task: BaseTask, horizon: int, options: MpcOptions) -> MpcData:
     if options.frame == "heading":
         require_turnable(Q)
     own, axis = limit_rows(task.limits, options.margin, options.soft_weight, horizon)
-    tilted = plan_tilt_rows(options.plan_tilt, task.limits, horizon)
-    rows = concatenate_rows(own, tilted)
+    bound = plan_bound(options, task.limits)
+    planned = plan_rows(bound, horizon)
+    rows = concatenate_rows(own, planned)
     return MpcData(
         coefficients=params.coefficients(),
         B_c=params.input_matrix(),
@@ -180,7 +205,7 @@ def mpc_data(task: BaseTask, horizon: int, options: MpcOptions) -> MpcData:
         R_rate=change_weight(options.R_rate),
         P=P,
         normals=rows.normals,
-        axis=np.r_[axis, np.full(len(tilted.normals), -1, np.int64)],
+        axis=np.r_[axis, np.full(len(planned.normals), -1, np.int64)],
         normal=rows.normal,
         stage=rows.stage,
         lower=rows.lower.copy(),  # without rows these are read-only views, another type to numba
@@ -197,7 +222,7 @@ def mpc_data(task: BaseTask, horizon: int, options: MpcOptions) -> MpcData:
         present=options.frame == "heading" and options.velocity_reference == "present",
         kinematics=False,
         iteration_limit=int(options.iteration_limit),
-        plan_tilt=float(options.plan_tilt) if len(tilted.normals) else math.inf,
+        plan_bound=bound,
         own_outputs=len(own.normals),
         own_rows=len(own.normal),
         model_tilt=PLAN_TILT,
@@ -363,7 +388,7 @@ class Mpc(ABC):
                 level = RELAXED
                 solution = self._backend.solve(qp)
                 iterations += solution.iterations
-            if solution.status != Status.OPTIMAL or not leaves_tilt(solution.x, self._data.plan_tilt):
+            if solution.status != Status.OPTIMAL or not leaves_bound(solution.x, self._data.plan_bound):
                 break
         if solution.status != Status.OPTIMAL and has_plan:
             return PREVIOUS_PLAN, iterations
@@ -377,7 +402,7 @@ class Mpc(ABC):
         return level, iterations
 
     def _row_sets(self) -> tuple[tuple[int, int], ...]:
-        """Outputs and rows of the task's limits, then with those of the plan's own tilt where it has one."""
+        """Outputs and rows of the task's limits, then with those of the plan's own where it has some."""
         own = self._data.own_outputs, self._data.own_rows
         every = len(self._data.normals), len(self._data.normal)
         return (own,) if own == every else (own, every)

@@ -23,7 +23,7 @@ from .linalg import copy
 from .ocp import IntArray
 from .present_axes import body_outputs
 from .riccati import DARE_SCRATCH
-from .solvers.active_set import INFEASIBLE, OPTIMAL
+from .solvers.active_set import INACCURATE, INFEASIBLE, OPTIMAL
 from .solvers.structured import Workspace, solve_structured
 from .solvers.working_set import pack_working_set, unpack_working_set
 
@@ -33,6 +33,7 @@ MEMORY_STAGE = N_INPUT + 1  # numbers that a plan and its working set take per s
 FROZEN_SPAN = 0.5  # rad, of roll, pitch or yaw, for which the pair taken at a state still serves
 _ROOM = 1e-3  # rad beyond, which a solver may leave of an active row
 GOVERNOR_REACH = 6.0  # m: beyond the starts of every id; a linear model asked for 15 m flips the vehicle
+_CLOSE = 1e-4  # of the largest force, and of a row: below what a model knows, above what round-off leaves
 
 
 class MpcData(NamedTuple):
@@ -62,7 +63,7 @@ class MpcData(NamedTuple):
     present: bool  # whether it stands in those of the present attitude, which do not turn along a plan
     kinematics: bool  # whether the model turns body rates into Euler rates at the present attitude
     iteration_limit: int
-    plan_tilt: float  # rad, of the plan's own rows, inf for none
+    plan_bound: Array  # (12,), magnitude of each state where the plan's own rows begin, inf for none
     own_outputs: int  # outputs and rows of the task's limits, which stand first
     own_rows: int
     model_tilt: float  # rad, roll and pitch up to which the model holds
@@ -406,6 +407,12 @@ def _widen(lower: Array, upper: Array) -> None:
 
 
 @kernel
+def _is_close(error: Array, force_max: Array) -> bool:
+    """Whether a plan that is optimal but for round-off may be flown; see `Workspace.error`."""
+    return error[0] <= _CLOSE * force_max[0] and error[1] <= _CLOSE
+
+
+@kernel
 def solve_row(
     A: Array,
     B: Array,
@@ -442,7 +449,8 @@ def solve_row(
             data.R_rate, data.iteration_limit, warm, ws,
         )  # fmt: skip
         iterations += count
-        if status == OPTIMAL:
+        close = status == INACCURATE and _is_close(ws.error, data.force_max)
+        if status == OPTIMAL or close:
             if warm or iterations > 0:
                 pack_working_set(ws.state[:n_rows], stage, ws.active, s.working)
             return level, iterations
@@ -463,6 +471,16 @@ def solve_row(
 
 
 @kernel
+def leaves_bound(x: Array, bound: Array) -> bool:
+    """Whether roll, pitch or a body rate of a plan (N+1, 12) is larger than its bound (12,)."""
+    for i in range(1, x.shape[0]):
+        for a in (6, 7, 9, 10, 11):
+            if abs(x[i, a]) > bound[a]:
+                return True
+    return False
+
+
+@kernel
 def leaves_tilt(x: Array, tilt: float) -> bool:
     """Whether a plan (N+1, 12) rolls or pitches beyond an angle, rad."""
     for i in range(1, x.shape[0]):
@@ -472,7 +490,7 @@ def leaves_tilt(x: Array, tilt: float) -> bool:
 
 
 @kernel
-def solve_within_tilt(
+def solve_within_model(
     A: Array,
     B: Array,
     Q: Array,
@@ -484,13 +502,13 @@ def solve_within_tilt(
     s: Scratch,
     ws: Workspace,
 ) -> tuple[int, int]:
-    """`solve_row` with the task's rows; where the plan tilts beyond what its model holds, with its own, too.
+    """`solve_row` with the task's rows; where the plan leaves what its model holds for, with its own, too.
 
     Most plans never come near: to leave those rows out at first costs them nothing.
     """
     H, K = data.own_outputs, data.own_rows
     level, iterations = solve_row(A, B, Q, Q_f, stationary, r, has_plan, H, K, data, s, ws)
-    if level <= RELAXED and leaves_tilt(ws.x, data.plan_tilt):
+    if level <= RELAXED and leaves_bound(ws.x, data.plan_bound):
         H, K = data.normals.shape[0], data.normal.shape[0]
         again, count = solve_row(A, B, Q, Q_f, stationary, r, has_plan, H, K, data, s, ws)
         level, iterations = max(level, again), iterations + count

@@ -29,6 +29,7 @@ from .mpc import (
     MpcOptions,
     Problem,
     SolverName,
+    default_rate,
     default_tilt,
     require_choice,
 )
@@ -40,7 +41,7 @@ from .mpc_kernels import (
     copy_vector,
     end_row,
     left_model,
-    solve_within_tilt,
+    solve_within_model,
 )
 from .ocp import IntArray
 from .solvers.structured import ITERATION_LIMIT, Workspace
@@ -262,7 +263,7 @@ def _decide_rows(
             linearise_model(data, s)
             linearise_cost(inertial, data, s)
             has_plan = memories[j, 0] > 0.0
-            level, count = solve_within_tilt(s.A, s.B, s.Q, s.P, False, s.target, has_plan, data, s, ws)
+            level, count = solve_within_model(s.A, s.B, s.Q, s.P, False, s.target, has_plan, data, s, ws)
             worst, iterations = max(worst, level), iterations + count
             if level > RELAXED or take_step(ws.u, ws.x, s) < CONVERGED:
                 break
@@ -295,6 +296,8 @@ class ExactNmpc(Mpc):
         R: Weight of the rotor forces, a number, the diagonal (4,) or a matrix; the reward's by default.
         plan_tilt: Largest roll and pitch of a plan, rad, besides the task's limit: where the model holds.
             None stands for 1.0 in frame "heading" and no such limit in frame "hover".
+        plan_rate: Largest roll and pitch rate of a plan, rad/s, half of it in yaw, likewise; by default
+            0.3 rad a sample.
         terminal: Factor of P, the weight of x_N, or a matrix (12, 12) in its place.
         R_rate: Weight of the changes of the forces from sample to sample, the first one against the command
             applied before; a number, the diagonal (4,) or a matrix. None: changes cost nothing.
@@ -320,6 +323,7 @@ class ExactNmpc(Mpc):
         Q: ArrayLike | None = None,
         R: ArrayLike | None = None,
         plan_tilt: float | None = None,
+        plan_rate: float | None = None,
         terminal: ArrayLike = 1.0,
         R_rate: ArrayLike | None = None,
     ) -> None:
@@ -327,7 +331,8 @@ class ExactNmpc(Mpc):
         require_choice("velocity_error", velocity_error, VelocityError)
         options = MpcOptions(
             solver, frame, "heading", soft_weight, margin, reject_disturbance, estimator_gain,
-            iteration_limit, Q, R, default_tilt(plan_tilt, EXACT_TILT, frame), terminal, R_rate,
+            iteration_limit, Q, R, default_tilt(plan_tilt, EXACT_TILT, frame),
+            default_rate(plan_rate, task.dt, frame), terminal, R_rate,
         )  # fmt: skip
         super().__init__(task, horizon, options, pairs=horizon, guess=True)
         self._data = self._data._replace(model_tilt=EXACT_TILT)

@@ -25,6 +25,7 @@ from .mpc import (
     MpcOptions,
     Problem,
     SolverName,
+    default_rate,
     default_tilt,
     require_choice,
 )
@@ -38,7 +39,7 @@ from .mpc_kernels import (
     end_row,
     hold_trim,
     left_model,
-    solve_within_tilt,
+    solve_within_model,
 )
 from .ocp import IntArray
 from .present_axes import pair_in_present_axes, stop_turning
@@ -179,7 +180,7 @@ def _decide_rows(
                 relinearise(ws.u, alpha, present, data, s)
                 stationary, pairs = False, N
             has_plan = memories[j, 0] > 0.0
-            level, count = solve_within_tilt(
+            level, count = solve_within_model(
                 s.A[:pairs], s.B[:pairs], data.Q, s.P, stationary, s.r, has_plan, data, s, ws
             )
             worst, iterations = max(worst, level), iterations + count
@@ -222,6 +223,8 @@ class SdcNmpc(Mpc):
         R: Weight of the rotor forces, a number, the diagonal (4,) or a matrix; the reward's by default.
         plan_tilt: Largest roll and pitch of a plan, rad, besides the task's limit: where the model holds.
             None stands for 0.8 in frame "heading" and no such limit in frame "hover".
+        plan_rate: Largest roll and pitch rate of a plan, rad/s, half of it in yaw, likewise; by default
+            0.3 rad a sample.
         terminal: Factor of P, the weight of x_N, or a matrix (12, 12) in its place.
         R_rate: Weight of the changes of the forces from sample to sample, the first one against the command
             applied before; a number, the diagonal (4,) or a matrix. None: changes cost nothing.
@@ -249,6 +252,7 @@ class SdcNmpc(Mpc):
         Q: ArrayLike | None = None,
         R: ArrayLike | None = None,
         plan_tilt: float | None = None,
+        plan_rate: float | None = None,
         terminal: ArrayLike = 1.0,
         R_rate: ArrayLike | None = None,
     ) -> None:
@@ -282,6 +286,7 @@ class SdcNmpc(Mpc):
             Q,
             R,
             default_tilt(plan_tilt, PLAN_TILT, frame),
+            default_rate(plan_rate, task.dt, frame),
             terminal,
             R_rate,
         )

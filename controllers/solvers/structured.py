@@ -33,6 +33,8 @@ from .active_set import (
     RowData,
     collect_multipliers,
     dual_active_set,
+    primal_direction,
+    project,
     row_slack,
     row_spans,
     worst_row,
@@ -70,6 +72,7 @@ class Workspace(NamedTuple):
     spans: IntArray  # (K, 2)
     state: ByteArray  # (16N + 2K,), of every row at the end
     guess: ByteArray  # (16N + 2K,), of every row, to start from
+    error: Array  # (2,), left after refinement: by how much another would move an input, and gaps of rows
     rate: RateWorkspace  # of a weight on changes; may be empty
 
 
@@ -113,6 +116,7 @@ def make_workspace(horizon: int, n_rows: int, n_models: int, weighs_changes: boo
         spans=np.zeros((n_rows, 2), dtype=np.int64),
         state=np.zeros(4 * nv + 2 * n_rows, dtype=np.int8),
         guess=np.zeros(4 * nv + 2 * n_rows, dtype=np.int8),
+        error=np.zeros(2),
         rate=make_rate_workspace(N, n_models, weighs_changes),
     )
 
@@ -299,7 +303,12 @@ def _finish(
         if attempt == 0 and relative <= REFINED and gap <= ROW_TOLERANCE:
             return OPTIMAL
     _, slack = worst_row(u, x, rows, ws.state)
-    return OPTIMAL if relative <= STATIONARY and max(gap, -slack) <= _ROW_ERROR else INACCURATE
+    project(ws.factors[0], ws.gradient, 0, u.size, ws.vectors[0])
+    primal_direction(ws.factors[0], ws.vectors[0], q, ws.vectors[1])
+    ws.error[0], ws.error[1] = 0.0, max(gap, -slack)
+    for k in range(u.size):
+        ws.error[0] = max(ws.error[0], abs(ws.vectors[1, k]))
+    return OPTIMAL if relative <= STATIONARY and ws.error[1] <= _ROW_ERROR else INACCURATE
 
 
 @kernel
@@ -330,6 +339,7 @@ def _solve_rows(
     else:
         inverse_factor(ws.K, ws.D, ws.A_cl, B, stationary, J_T, ws.wide)
     q = 0
+    ws.error[0] = math.inf
     _clear(ws.state, 4 * u.size + 2 * rows.normal.shape[0])
     if warm:
         guess = ws.guess[: 4 * u.size + 2 * rows.normal.shape[0]]
@@ -345,7 +355,10 @@ def _solve_rows(
     if not (_all_finite(u) and _all_finite(x)):
         return NOT_FINITE, iterations
     finished = _finish(A, B, c, Q, R, Q_f, x_0, r, R_rate, u_last, rows, q, ws)
-    return (finished if status == OPTIMAL else status), iterations
+    if status != OPTIMAL:
+        ws.error[0] = math.inf
+        return status, iterations
+    return finished, iterations
 
 
 @kernel
