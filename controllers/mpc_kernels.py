@@ -409,7 +409,7 @@ def _widen(lower: Array, upper: Array) -> None:
 @kernel
 def _is_close(error: Array, force_max: Array) -> bool:
     """Whether a plan that is optimal but for round-off may be flown; see `Workspace.error`."""
-    return error[0] <= _CLOSE * force_max[0] and error[1] <= _CLOSE
+    return bool(error[0] <= _CLOSE * force_max[0] and error[1] <= _CLOSE)
 
 
 @kernel
