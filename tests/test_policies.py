@@ -125,7 +125,7 @@ def test_an_option_that_mpcs_share_has_one_default():
     linear, *others = (policy_options(name) for name in ("lmpc", "sdc-nmpc", "nmpc"))
     for other in others:
         shared = (linear.keys() & other.keys()) - {"velocity_reference"}  # its model alone has level axes
-        assert len(shared) == 13
+        assert len(shared) == 14
         assert [linear[name] for name in shared] == [other[name] for name in shared]
 
 
