@@ -8,55 +8,57 @@ from quad_envs.lazy import load_public, public_names
 
 if TYPE_CHECKING:
     from .benchmark import run_benchmark
-    from .comparison import Results
-    from .conformance import check_policy
     from .errors import CheckpointError, PolicyCheckError, PolicyError, ResultsError, TrainingError
-    from .estimate_wrapper import EstimateWrapper
-    from .evaluation import Evaluation
-    from .export import export_policy
-    from .figures.episodes import plot_episode
-    from .metrics import Estimate, Record, estimate, measure, paired_difference
-    from .policy import Policy, PolicyState, make_policy, policy_options
-    from .rollout import Episode, run_episodes
-    from .sb3_policy import sb3
+    from .evaluation.evaluate import Evaluation
+    from .evaluation.metrics import Estimate, estimate, measure, paired_difference
+    from .evaluation.record import Record
+    from .evaluation.rollout import Episode, run_episodes
+    from .policies.conformance import check_policy
+    from .policies.estimate_wrapper import EstimateWrapper
+    from .policies.export import export_policy
+    from .policies.protocol import Policy, PolicyState
+    from .policies.registry import make_policy, policy_options
+    from .policies.sb3_policy import sb3
+    from .policies.trained import load_policy, shipped_policies
+    from .report.figures.episodes import plot_episode
     from .single import evaluate
-    from .suite import Suite
-    from .suite_files import load_suite
-    from .trained import load_policy, shipped_policies
+    from .sweeps.comparison import Results
+    from .sweeps.suite import Suite
+    from .sweeps.suite_files import load_suite
     from .training.runs import TrainingResult, train
 
 # Public name -> module; loaded at first use, so that importing the package stays cheap.
 _PUBLIC = {
     "CheckpointError": "errors",
-    "Episode": "rollout",
-    "Estimate": "metrics",
-    "EstimateWrapper": "estimate_wrapper",
-    "Evaluation": "evaluation",
-    "Policy": "policy",
+    "Episode": "evaluation.rollout",
+    "Estimate": "evaluation.metrics",
+    "EstimateWrapper": "policies.estimate_wrapper",
+    "Evaluation": "evaluation.evaluate",
+    "Policy": "policies.protocol",
     "PolicyCheckError": "errors",
     "PolicyError": "errors",
-    "PolicyState": "policy",
-    "Record": "metrics",
-    "Results": "comparison",
+    "PolicyState": "policies.protocol",
+    "Record": "evaluation.record",
+    "Results": "sweeps.comparison",
     "ResultsError": "errors",
-    "Suite": "suite",
+    "Suite": "sweeps.suite",
     "TrainingError": "errors",
     "TrainingResult": "training.runs",
-    "check_policy": "conformance",
-    "estimate": "metrics",
+    "check_policy": "policies.conformance",
+    "estimate": "evaluation.metrics",
     "evaluate": "single",
-    "export_policy": "export",
-    "load_policy": "trained",
-    "load_suite": "suite_files",
-    "make_policy": "policy",
-    "measure": "metrics",
-    "paired_difference": "metrics",
-    "plot_episode": "figures.episodes",
-    "policy_options": "policy",
+    "export_policy": "policies.export",
+    "load_policy": "policies.trained",
+    "load_suite": "sweeps.suite_files",
+    "make_policy": "policies.registry",
+    "measure": "evaluation.metrics",
+    "paired_difference": "evaluation.metrics",
+    "plot_episode": "report.figures.episodes",
+    "policy_options": "policies.registry",
     "run_benchmark": "benchmark",
-    "run_episodes": "rollout",
-    "sb3": "sb3_policy",
-    "shipped_policies": "trained",
+    "run_episodes": "evaluation.rollout",
+    "sb3": "policies.sb3_policy",
+    "shipped_policies": "policies.trained",
     "train": "training.runs",
 }
 

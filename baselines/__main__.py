@@ -8,9 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from .errors import MissingPackageError
-from .interruptions import exit_code, remembered
-from .options import (
+from .cli.options import (
     BenchmarkOptions,
     CertifyOptions,
     DoctorOptions,
@@ -26,7 +24,9 @@ from .options import (
     read_options,
     refuse_unknown,
 )
-from .streams import quiet_pipe, take_streams
+from .cli.streams import quiet_pipe, take_streams
+from .errors import MissingPackageError
+from .interruptions import exit_code, remembered
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -40,61 +40,61 @@ class Command(NamedTuple):
 
 
 def _list(options: ListOptions) -> int:
-    from . import commands
+    from .cli import commands
 
     return commands.list_names(options)
 
 
 def _evaluate(options: EvaluateOptions) -> int:
-    from . import commands
+    from .cli import commands
 
     return commands.evaluate_one(options)
 
 
 def _benchmark(options: BenchmarkOptions) -> int:
-    from . import commands
+    from .cli import commands
 
     return commands.benchmark_suite(options)
 
 
 def _train(options: TrainOptions) -> int:
-    from . import train_command
+    from .cli import train as train_command
 
     return train_command.train_one(options)
 
 
 def _export(options: ExportOptions) -> int:
-    from . import export_command
+    from .cli import export as export_command
 
     return export_command.export_one(options)
 
 
 def _reproduce(options: ReproduceOptions) -> int:
-    from . import reproduce
+    from . import reproduction as reproduce
 
     return int(reproduce.run(options.what, options.out, options.json, options.jobs))
 
 
 def _report(options: ReportOptions) -> int:
-    from .report import commands
+    from .cli import report as commands
 
     return commands.make_page(options)
 
 
 def _replay(options: ReplayOptions) -> int:
-    from .report import commands
+    from .cli import report as commands
 
     return commands.replay(options)
 
 
 def _certify(options: CertifyOptions) -> int:
-    from .certify import command
+    from .cli import certify as command
 
     return command.certify_one(options)
 
 
 def _doctor(options: DoctorOptions) -> int:
-    from . import doctor
+    from .cli import doctor
 
     return doctor.examine(options.json)
 

@@ -10,18 +10,18 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from .checks import require_jobs
-from .comparison import Results
-from .engines import check_engine
-from .environments import make_env
-from .outside import name_of
-from .policy import from_outside, is_trained, make_policy, mission_of, policy_entry
-from .results import locked
-from .suite import PolicyChoice, Suite
-from .suite_files import load_suite
-from .sweep import Order, Sweep, with_given
-from .training.finished import training_plan
-from .units import Given, Unit, suite_units, training_units
+from .evaluation.amounts import require_jobs
+from .files import locked
+from .policies.environments import make_env
+from .policies.outside import name_of
+from .policies.registry import from_outside, is_trained, make_policy, mission_of, policy_entry
+from .sweeps.comparison import Results
+from .sweeps.engines import check_engine
+from .sweeps.finished import training_plan
+from .sweeps.suite import PolicyChoice, Suite
+from .sweeps.suite_files import load_suite
+from .sweeps.sweep import Order, Sweep, with_given
+from .sweeps.units import Given, Unit, suite_units, training_units
 
 
 def run_benchmark(

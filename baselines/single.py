@@ -11,15 +11,16 @@ from quad_envs.names import shown
 from quad_envs.tasks import BaseTask, TeamTask
 
 from .benchmark import fly_suite
-from .environments import require_own_task
-from .episode import Episode
-from .evaluation import Evaluation, fly_and_measure
-from .outside import name_of
-from .policy import Policy, policy_name
-from .results import plain_json
-from .suite import EnvChoice, PolicyChoice, Suite
-from .sweep import Order
-from .units import Given
+from .evaluation.episode import Episode
+from .evaluation.evaluate import Evaluation, fly_and_measure
+from .files import plain_json
+from .policies.environments import require_own_task
+from .policies.outside import name_of
+from .policies.protocol import Policy
+from .policies.registry import policy_name
+from .sweeps.suite import EnvChoice, PolicyChoice, Suite
+from .sweeps.sweep import Order
+from .sweeps.units import Given
 
 
 def evaluate(

@@ -24,7 +24,7 @@ one_thread()
 import numpy as np  # noqa: E402
 
 from baselines import make_policy  # noqa: E402
-from baselines.table import format_table  # noqa: E402
+from baselines.evaluation.table import format_table  # noqa: E402
 from quad_envs import formation_v0  # noqa: E402
 
 TEAMS = (6, 20, 100)

@@ -27,7 +27,7 @@ import numpy as np  # noqa: E402
 
 import quad_envs  # noqa: E402
 from baselines import make_policy  # noqa: E402
-from baselines.table import format_table  # noqa: E402
+from baselines.evaluation.table import format_table  # noqa: E402
 
 _JUMPS = np.array([(0.0, 0.0, 0.0), (3.0, 3.0, 3.0), (3.0, -3.0, 1.0), (-2.0, 1.0, -3.0)])
 

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from baselines import evaluate, make_policy
-from baselines.results import read_json
-from baselines.table import format_number, format_table
+from baselines.evaluation.table import format_number, format_table
+from baselines.files import read_json
 from baselines.training.held_out import CHOOSING, HeldOutFlights, Point
 from baselines.training.run_folder import RunFolder
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from controllers import dare, hover_pair
-from controllers.ocp import OcpQp, condense, first_move_bounds
-from controllers.solvers import Multipliers, Solution, Status
+from controllers.qp import Multipliers, Solution, Status
+from controllers.qp.ocp import OcpQp, condense, first_move_bounds
 from quad_envs.constraints import actions_from_forces
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 from quad_envs.tasks import Task

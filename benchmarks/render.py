@@ -19,7 +19,7 @@ one_thread()
 import gymnasium as gym  # noqa: E402
 import numpy as np  # noqa: E402
 
-from baselines.table import format_table  # noqa: E402
+from baselines.evaluation.table import format_table  # noqa: E402
 from quad_envs import formation_v0, target_tracking_v0  # noqa: E402
 
 _STEPS = 20  # control steps before the picture

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from baselines.table import format_table
+from baselines.evaluation.table import format_table
 from controllers.model import hover_pair
-from controllers.ocp import OcpQp, no_rows, output_rows
-from controllers.solvers import Solution, Status, StructuredSolver, residuals
+from controllers.qp import Solution, Status, StructuredSolver, residuals
+from controllers.qp.ocp import OcpQp, no_rows, output_rows
 from quad_envs.parameters import N_INPUT, N_STATE, Array, QuadrotorParams
 
 HORIZONS = (1, 2, 3, 5, 8, 10, 15, 20, 25, 40, 60)

@@ -24,7 +24,7 @@ import gymnasium as gym  # noqa: E402
 import numpy as np  # noqa: E402
 
 import quad_envs  # noqa: E402, F401
-from baselines.table import format_table  # noqa: E402
+from baselines.evaluation.table import format_table  # noqa: E402
 
 _ID = "quad/HelixTracking-v0"
 _STEPS = 1000  # control steps of a single environment in one call

@@ -2,19 +2,19 @@
 
 from quad_envs.lazy import public_names
 
-from .collision import AvoidanceOptions
-from .consensus import ConsensusOptions, TargetEstimate, consensus_reference
 from .controller import Controller, Decision
-from .cooperative_mpc import CooperativeDecision, CooperativeMpc
 from .fallback import Fallback
-from .feedback_linearization import FeedbackLinearization
-from .lmpc import LinearMPC
+from .feedback.feedback_linearization import FeedbackLinearization
+from .feedback.sdre import Lqr, Sdre
 from .model import hover_pair, sdc_pair
-from .nmpc import ExactNmpc
-from .ocp import OcpQp, StateRows
-from .riccati import dare, lqr_gain
-from .sdc_nmpc import SdcNmpc
-from .sdre import Lqr, Sdre
+from .mpc.exact import ExactNmpc
+from .mpc.lmpc import LinearMPC
+from .mpc.sdc import SdcNmpc
+from .qp.ocp import OcpQp, StateRows
+from .qp.riccati import dare, lqr_gain
+from .team.collision import AvoidanceOptions
+from .team.consensus import ConsensusOptions, TargetEstimate, consensus_reference
+from .team.cooperative import CooperativeDecision, CooperativeMpc
 
 __all__ = [
     "AvoidanceOptions",

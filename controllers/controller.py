@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike
 
 from quad_envs._numba import kernel
 from quad_envs.checks import array_bytes, require_whole
-from quad_envs.observations import N_REFERENCE
+from quad_envs.observations.tracking import N_REFERENCE
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 
 from .disturbance import N_DISTURBANCE
-from .ocp import IntArray
+from .qp.ocp import IntArray
 
 PLANT_SIZE = N_STATE + N_INPUT
 MOST_HORIZON = 1000  # samples; a solver fills matrices with the square of it

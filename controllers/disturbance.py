@@ -26,7 +26,7 @@ from quad_envs.parameters import (
 )
 from quad_envs.rotations import sincos
 
-from .ocp import IntArray
+from .qp.ocp import IntArray
 
 N_DISTURBANCE = 6
 PLANT_SIZE = 16

@@ -25,7 +25,7 @@ from quad_envs.parameters import (
 )
 from quad_envs.rotations import sincos
 
-from .linalg import fill, matmul
+from .qp.linalg import fill, matmul
 
 ZOH_SCRATCH = 3  # (12, 12) matrices that `zero_order_hold` needs
 RK4_SCRATCH = 52  # rows of 16 that `rk4_sensitivities` needs

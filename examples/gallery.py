@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from baselines import make_policy
-from baselines.environments import is_parallel, make_env
+from baselines.policies.environments import is_parallel, make_env
 
 _SIZE = (480, 360)
 _COLOURS = 160  # of a picture; fewer turn the blue of a small vehicle grey

@@ -7,9 +7,9 @@ from typing import Any
 from pettingzoo import AECEnv
 from pettingzoo.utils import parallel_to_aec
 
-from .envs.target_tracking import CooperativeEstimationEnv as raw_env
-from .envs.team_options import EstimationOptions
-from .envs.team_vector import TeamVectorEnv
+from .envs.team.options import EstimationOptions
+from .envs.team.target_tracking import CooperativeEstimationEnv as raw_env
+from .envs.team.vector import TeamVectorEnv
 
 __all__ = ["env", "parallel_env", "raw_env", "vector_env"]
 

@@ -7,9 +7,9 @@ from typing import Any
 from pettingzoo import AECEnv
 from pettingzoo.utils import parallel_to_aec
 
-from .envs.formation import FormationEnv as raw_env
-from .envs.team_options import FormationOptions
-from .envs.team_vector import TeamVectorEnv
+from .envs.team.formation import FormationEnv as raw_env
+from .envs.team.options import FormationOptions
+from .envs.team.vector import TeamVectorEnv
 
 __all__ = ["env", "parallel_env", "raw_env", "vector_env"]
 

@@ -11,8 +11,8 @@ from gymnasium.envs.registration import EnvSpec
 from .episode_limit import SuiteSpec
 from .names import shown
 
-ENTRY = "quad_envs.envs.tracking:TrackingEnv"
-VECTOR_ENTRY = "quad_envs.envs.tracking_vector:TrackingVectorEnv"
+ENTRY = "quad_envs.envs.tracking.env:TrackingEnv"
+VECTOR_ENTRY = "quad_envs.envs.tracking.vector:TrackingVectorEnv"
 
 TIME_LIMIT, DT = 10.0, 0.05  # s, length of an episode and control period, where nothing else is said
 # Defaults of each tracking id; any keyword argument of TrackingEnv overrides them in `gymnasium.make`.

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .agent_observations import AgentLayout
 from .constraints import constraint_names
-from .observations import TrackingLayout
+from .observations.team import AgentLayout
+from .observations.tracking import TrackingLayout
 from .parameters import Array, Limits, QuadrotorParams, Weights
 
 _Triple = tuple[float, float, float]

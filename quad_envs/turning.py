@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ._numba import inline_kernel, kernel
-from .observations import N_REFERENCE
+from .observations.tracking import N_REFERENCE
 from .parameters import Array
 from .rotations import wrap_angle
 

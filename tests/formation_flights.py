@@ -1,6 +1,6 @@
 """Closed loops of a team for the controller tests, with every observation made here from the true states.
 
-The rows are those of `quad_envs.agent_observations`: `messages` the comm slots (delay 0, a fixed slot per
+The rows are those of `quad_envs.observations.team`: `messages` the comm slots (delay 0, a fixed slot per
 in-neighbour), `sensed_rows` the sensed slots (within the radius, most urgent first). No environment takes
 part.
 """
@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quad_envs.agent_observations import AgentLayout
 from quad_envs.dynamics import simulate
 from quad_envs.formations import make_formation, start_positions
 from quad_envs.graphs import make_graph, toward_leader
+from quad_envs.observations.team import AgentLayout
 from quad_envs.parameters import Limits
 from quad_envs.rotations import rotation_body_from_inertial
 from quad_envs.tasks import TeamTask

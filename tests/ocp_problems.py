@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import scipy.linalg
 
-from controllers.ocp import OcpQp, StateRows, concatenate_rows, no_rows, output_rows
-from controllers.riccati import dare
+from controllers.qp.ocp import OcpQp, StateRows, concatenate_rows, no_rows, output_rows
+from controllers.qp.riccati import dare
 from quad_envs.parameters import ATTITUDE, POSITION, RATES, VELOCITY, QuadrotorParams
 
 DT = 0.05

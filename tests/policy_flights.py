@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from baselines import make_policy
-from baselines.estimate_wrapper import EstimateWrapper
+from baselines.policies.estimate_wrapper import EstimateWrapper
 from quad_envs import target_tracking_v0
 
 CASE_START = tuple((0.0, y, 0.0) for y in np.linspace(-2.5, 2.5, 6))

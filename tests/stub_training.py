@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from baselines import TrainingError
-from baselines.training import Network, networks
+from baselines.policies import network as networks
+from baselines.policies.network import Network
 from baselines.training.algorithms import ALGORITHMS, Algorithm
 
 

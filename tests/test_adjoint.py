@@ -6,8 +6,8 @@ import pytest
 
 from quad_envs.adjoint import SCRATCH_ROWS, step_vjp
 from quad_envs.dynamics import simulate
-from quad_envs.envs.adjoint import action_slopes, reward_vjp, tracking_vjp_rows
-from quad_envs.envs.kernel import task_vector
+from quad_envs.envs.tracking.adjoint import action_slopes, reward_vjp, tracking_vjp_rows
+from quad_envs.envs.tracking.kernel import task_vector
 from quad_envs.parameters import QuadrotorParams
 from quad_envs.references import Heading, make_reference
 from quad_envs.turning import with_turn_rates

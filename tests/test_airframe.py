@@ -6,7 +6,7 @@ import pytest
 
 from baselines import evaluate, make_policy
 from controllers import ExactNmpc, FeedbackLinearization, LinearMPC, Lqr, SdcNmpc, Sdre
-from controllers.central_mpc import CentralMpc
+from controllers.team.central import CentralMpc
 from quad_envs._numba import kernel
 from quad_envs.adjoint import step_vjp
 from quad_envs.dynamics import derivative_reference, rigid_body, rotor_shares, simulate

@@ -13,13 +13,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import baselines.results
-import baselines.sweep
+import baselines.files
+import baselines.sweeps.sweep
 from baselines import Results, ResultsError, Suite, load_suite, run_benchmark
-from baselines.evaluation import Evaluation
-from baselines.policy import TRACKING_POLICIES
-from baselines.results import locked, plain_json, write_atomic, write_csv
-from baselines.suite_files import suite_names
+from baselines.evaluation.evaluate import Evaluation
+from baselines.files import locked, plain_json, write_atomic, write_csv
+from baselines.policies.registry import TRACKING_POLICIES
+from baselines.sweeps.suite_files import suite_names
 from quad_envs.registration import TRACKING
 
 SMALL = {
@@ -50,13 +50,13 @@ def finished(tmp_path_factory):
 def flown(monkeypatch):
     """Titles of the units that are flown."""
     titles = []
-    real = baselines.sweep.fly_unit
+    real = baselines.sweeps.sweep.fly_unit
 
     def count(unit):
         titles.append((unit.env.title, unit.policy.title))
         return real(unit)
 
-    monkeypatch.setattr(baselines.sweep, "fly_unit", count)
+    monkeypatch.setattr(baselines.sweeps.sweep, "fly_unit", count)
     return titles
 
 
@@ -153,7 +153,7 @@ def test_another_suite_in_the_same_folder_is_refused(tmp_path):
 
 def test_results_of_other_sources_are_not_mixed(tmp_path, monkeypatch):
     run_benchmark(SMALL, tmp_path)
-    monkeypatch.setattr(baselines.sweep, "source_digest", lambda: "0123abc")
+    monkeypatch.setattr(baselines.sweeps.sweep, "source_digest", lambda: "0123abc")
     with pytest.raises(ResultsError, match="begun with other sources"):
         run_benchmark(SMALL, tmp_path)
 
@@ -167,7 +167,7 @@ def test_a_folder_in_use_is_refused(tmp_path):
 
 def test_a_folder_is_free_when_its_process_was_killed(tmp_path):
     code = (
-        "import sys, time; from pathlib import Path; from baselines.results import locked\n"
+        "import sys, time; from pathlib import Path; from baselines.files import locked\n"
         "with locked(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE) as process:
@@ -322,7 +322,7 @@ def test_bad_arguments_of_a_sweep_are_refused(arguments, message):
 
 @pytest.mark.parametrize(("engine", "package"), [("ray", "ray"), ("dask", "distributed")])
 def test_an_engine_that_is_not_installed_says_how_to_install_it(engine, package, monkeypatch):
-    monkeypatch.setattr(baselines.engines, "find_spec", lambda name: None)
+    monkeypatch.setattr(baselines.sweeps.engines, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=f"needs the package {package}: pip install"):
         run_benchmark(SMALL, engine=engine)
 

@@ -10,15 +10,15 @@ import pytest
 
 from baselines import evaluate, make_policy, run_benchmark
 from baselines.certify import certify
-from baselines.suite import EnvChoice, PolicyChoice, Suite
+from baselines.sweeps.suite import EnvChoice, PolicyChoice, Suite
 from baselines.training.plans import make_plan
 from quad_envs import checks, cooperative_estimation_v0, formation_v0, target_tracking_v0
 from quad_envs.checks import Bound, require_memory, require_number, require_whole
 from quad_envs.disturbances import Gusts, Steady
-from quad_envs.envs.options import TrackingOptions
-from quad_envs.envs.tables import draw_vehicle
-from quad_envs.envs.team_options import EstimationOptions, FormationOptions
-from quad_envs.envs.vehicle_options import RANDOMIZABLE
+from quad_envs.envs.shared.tables import draw_vehicle
+from quad_envs.envs.shared.vehicle_options import RANDOMIZABLE
+from quad_envs.envs.team.options import EstimationOptions, FormationOptions
+from quad_envs.envs.tracking.options import TrackingOptions
 from quad_envs.formations import tried_starts
 from quad_envs.kinds import is_number
 from quad_envs.names import shown

@@ -19,9 +19,9 @@ from formation_flights import (
     team_task,
 )
 
-from controllers.central_mpc import CentralMpc
-from controllers.cooperative_mpc import CooperativeMpc
 from controllers.fallback import Fallback
+from controllers.team.central import CentralMpc
+from controllers.team.cooperative import CooperativeMpc
 from quad_envs.dynamics import simulate
 from quad_envs.parameters import Limits
 

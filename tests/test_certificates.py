@@ -9,7 +9,8 @@ from flights import TASK, WEAK, at_rest, decide_once, plan_of, rest, window
 from ocp_problems import HOVER_P, hover_qp, velocity_rows
 
 from controllers import LinearMPC, Lqr, SdcNmpc, Sdre, hover_pair, sdc_pair
-from controllers.certificates import (
+from controllers.qp import StructuredSolver
+from controllers.stability.certificates import (
     best_gain,
     linear_matrix_inequality,
     plan_cost,
@@ -19,14 +20,13 @@ from controllers.certificates import (
     terminal_decrease,
     terminal_rows,
 )
-from controllers.invariant import (
+from controllers.stability.invariant import (
     Halfspaces,
     inscribed_ellipsoid,
     largest_ellipsoid,
     law_halfspaces,
     sample_ellipsoid,
 )
-from controllers.solvers import StructuredSolver
 from quad_envs.parameters import Limits
 from quad_envs.tasks import Task
 
@@ -238,7 +238,7 @@ def test_without_the_packages_the_message_names_the_extra(monkeypatch):
     def missing(name):
         raise ImportError(f"No module named {name!r}")
 
-    monkeypatch.setattr(importlib.import_module("controllers.invariant"), "import_module", missing)
+    monkeypatch.setattr(importlib.import_module("controllers.stability.invariant"), "import_module", missing)
     with pytest.raises(ModuleNotFoundError, match=r"pip install .* -e \"\.\[lmi\]\""):
         largest_ellipsoid(HALF, BOX)
 

@@ -11,8 +11,8 @@ from baselines.certify import certify, verdicts
 from baselines.certify.flight import Trace
 from baselines.certify.verdicts import FAILS, HOLDS, LINEAR_ONLY
 from baselines.errors import MissingPackageError
-from baselines.figures import house_style, new_figure, save_figure
-from baselines.figures.style import ellipse
+from baselines.report.figures import house_style, new_figure, save_figure
+from baselines.report.figures.style import ellipse
 
 REGULATION = "quad/Regulation-v0"
 SHORT = {"time_limit": 1.0}

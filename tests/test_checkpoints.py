@@ -12,9 +12,17 @@ import numpy as np
 import pytest
 
 from baselines import CheckpointError, check_policy, evaluate, load_policy, make_policy, shipped_policies
-from baselines.environments import make_env, task_of
-from baselines.training import Network, NetworkPolicy, load_checkpoint, save_checkpoint
-from baselines.training.networks import Features, default_features, hover_actions, hover_outputs, hover_slopes
+from baselines.policies.checkpoints import load_checkpoint, save_checkpoint
+from baselines.policies.environments import make_env, task_of
+from baselines.policies.network import (
+    Features,
+    Network,
+    NetworkPolicy,
+    default_features,
+    hover_actions,
+    hover_outputs,
+    hover_slopes,
+)
 
 HELIX, FORMATION = "quad/HelixTracking-v0", "quad/Formation-v0"
 ABOUT = {"env_id": HELIX, "mission": "tracking", "algorithm": "apg", "kind": "model-based", "score": 0.5}
@@ -194,7 +202,7 @@ def pickle_in_disguise(folder):
 def not_finite(folder):
     from safetensors.numpy import load_file, save_file
 
-    from baselines.training.checkpoints import _digest
+    from baselines.policies.checkpoints import _digest
 
     tensors = load_file(folder / "network.safetensors")
     tensors["1.weight"][0, 0] = np.nan
@@ -205,7 +213,7 @@ def not_finite(folder):
 def wrong_shapes(folder):
     from safetensors.numpy import load_file, save_file
 
-    from baselines.training.checkpoints import _digest
+    from baselines.policies.checkpoints import _digest
 
     tensors = load_file(folder / "network.safetensors")
     tensors["1.weight"] = tensors["1.weight"][:5].copy()
@@ -362,7 +370,7 @@ def test_a_full_disk_leaves_the_checkpoint_before_whole(saved, monkeypatch):
     def full(path, data):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("baselines.training.checkpoints.write_atomic", full)
+    monkeypatch.setattr("baselines.policies.checkpoints.write_atomic", full)
     with pytest.raises(CheckpointError, match=r"No space left on device.*the one before it"):
         save_checkpoint(saved, network_for(seed=1), ABOUT)
     assert np.array_equal(load_checkpoint(saved)[0].weights[0], network_for().weights[0])
@@ -370,6 +378,6 @@ def test_a_full_disk_leaves_the_checkpoint_before_whole(saved, monkeypatch):
 
 
 def test_shipped_policies_go_by_name(saved, monkeypatch):
-    monkeypatch.setattr("baselines.trained.SHIPPED", saved.parent)
+    monkeypatch.setattr("baselines.policies.trained.SHIPPED", saved.parent)
     assert shipped_policies() == {"run": "apg (model-based) on quad/HelixTracking-v0, score 0.500"}
     assert make_policy("run", HELIX).name == "run"

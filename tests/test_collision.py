@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from formation_flights import at_rest, messages, sensed_rows, team_task, velocities
 
-from controllers.collision import COLLISION_SCRATCH, AvoidanceOptions, separation_rows
+from controllers.team.collision import COLLISION_SCRATCH, AvoidanceOptions, separation_rows
 from quad_envs.rotations import rotation_body_from_inertial
 
 N, DT, D_S, R_S = 5, 0.05, 0.4, 2.0

@@ -16,10 +16,10 @@ import pytest
 from processes import start_command
 
 from baselines.__main__ import COMMANDS, main
-from baselines.commands import _resume
-from baselines.options import BenchmarkOptions, read_assignments
-from baselines.policy import TEAM_POLICIES, TRACKING_POLICIES
-from baselines.sweep import REPORTED
+from baselines.cli.commands import _resume
+from baselines.cli.options import BenchmarkOptions, read_assignments
+from baselines.policies.registry import TEAM_POLICIES, TRACKING_POLICIES
+from baselines.sweeps.sweep import REPORTED
 from quad_envs.registration import TEAMS, TRACKING
 
 HELIX = "quad/HelixTracking-v0"
@@ -307,7 +307,7 @@ def test_doctor_examines_the_installation(capsys):
 
 
 def test_doctor_names_a_package_of_the_same_name(monkeypatch):
-    from baselines import doctor
+    from baselines.cli import doctor
 
     monkeypatch.setattr(
         doctor.metadata, "packages_distributions", lambda: {"controllers": ["quad-envs", "webapp"]}

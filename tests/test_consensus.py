@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from controllers.consensus import ConsensusOptions, TargetEstimate, consensus_reference
+from controllers.team.consensus import ConsensusOptions, TargetEstimate, consensus_reference
 from quad_envs.rotations import rotation_body_from_inertial
 
 DT, G = 0.05, 9.8

@@ -8,11 +8,11 @@ import pytest
 from stub_training import stubs  # noqa: F401
 
 from baselines import ResultsError, Suite, load_suite, run_benchmark
-from baselines.contenders import ALL
-from baselines.environments import make_env
-from baselines.suite_files import suite_from_dict
-from baselines.training.finished import train_unit
-from baselines.units import suite_units, training_units
+from baselines.policies.environments import make_env
+from baselines.sweeps.contenders import ALL
+from baselines.sweeps.finished import train_unit
+from baselines.sweeps.suite_files import suite_from_dict
+from baselines.sweeps.units import suite_units, training_units
 
 SHORT = {"time_limit": 1.0}
 LEARNED = {
@@ -70,7 +70,7 @@ def test_training_seeds_are_one_contender_and_the_base_is_no_better_than_itself(
 
 def test_networks_are_trained_once_and_may_lie_elsewhere(tmp_path, monkeypatch):
     first = run_benchmark(LEARNED, tmp_path / "a", networks=tmp_path / "nets")
-    monkeypatch.setattr("baselines.training.finished.train", None)  # it would fail
+    monkeypatch.setattr("baselines.sweeps.finished.train", None)  # it would fail
     second = run_benchmark(LEARNED, tmp_path / "b", networks=tmp_path / "nets", jobs=1)
     scores = [[row["score"] for row in results.rows()] for results in (first, second)]
     assert scores[0] == scores[1] and not (tmp_path / "a" / "networks").exists()

@@ -20,12 +20,12 @@ from formation_flights import (
     velocities,
 )
 
-from controllers.central_mpc import level_frame_weight
-from controllers.cooperative_kernels import level_weight
-from controllers.cooperative_mpc import CooperativeMpc
 from controllers.fallback import Fallback
-from controllers.ocp import condense
-from controllers.solvers import StructuredSolver, residuals
+from controllers.qp import StructuredSolver, residuals
+from controllers.qp.ocp import condense
+from controllers.team.central import level_frame_weight
+from controllers.team.cooperative import CooperativeMpc
+from controllers.team.cooperative_kernels import level_weight
 from quad_envs.dynamics import simulate
 from quad_envs.rotations import rotation_body_from_inertial
 

@@ -12,13 +12,20 @@ from formation_flights import messages, preview_rows, sensed_rows
 from policy_flights import DISSERTATION, chapter_7_env, chapter_7_flight, fly
 
 from baselines import check_policy, make_policy
-from baselines.cooperative_decoding import decode_rows, empty_parts, part_starts
-from baselines.policy import TEAM_MISSIONS, TEAM_POLICIES, mission_of, policy_entry, policy_options, serving
-from controllers.cooperative_mpc import CooperativeMpc
+from baselines.policies.decoding import decode_rows, empty_parts, part_starts
+from baselines.policies.registry import (
+    TEAM_MISSIONS,
+    TEAM_POLICIES,
+    mission_of,
+    policy_entry,
+    policy_options,
+    serving,
+)
+from controllers.team.cooperative import CooperativeMpc
 from quad_envs import cooperative_estimation_v0, formation_v0, target_tracking_v0
-from quad_envs.agent_observations import AgentLayout
 from quad_envs.constraints import actions_from_forces
 from quad_envs.graphs import make_graph
+from quad_envs.observations.team import AgentLayout
 
 MODULES = {
     "formation": formation_v0,

@@ -15,7 +15,7 @@ from quad_envs.disturbances import (
     disturbance_of,
     make_disturbance,
 )
-from quad_envs.envs.tracking import TrackingEnv
+from quad_envs.envs.tracking.env import TrackingEnv
 from quad_envs.parameters import Limits, QuadrotorParams
 
 DT, NODES = 0.05, 11

@@ -10,7 +10,7 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 from policy_flights import fly
 
 from baselines import check_policy, make_policy
-from baselines.estimate_wrapper import EstimateWrapper
+from baselines.policies.estimate_wrapper import EstimateWrapper
 from controllers.estimation import covariance_intersection
 from controllers.estimation.ekf import constant_velocity_model
 from quad_envs import cooperative_estimation_v0, formation_v0, target_tracking_v0

@@ -10,7 +10,7 @@ import quad_envs  # noqa: F401  registers the ids
 from baselines import evaluate, make_policy
 from controllers import LinearMPC
 from controllers.disturbance import ESTIMATOR_GAIN
-from controllers.estimator_gain import error_variance, estimator_gains
+from controllers.mpc.estimator_gain import error_variance, estimator_gains
 from quad_envs.tasks import Task
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from baselines import EstimateWrapper, PolicyCheckError, check_policy, evaluate, make_policy
-from baselines.pairing import JUDGED_ONLY
+from baselines.policies.pairing import JUDGED_ONLY
 from quad_envs import formation_v0, target_tracking_v0
 
 HELIX, FORMATION = "quad/HelixTracking-v0", "quad/Formation-v0"

@@ -15,7 +15,7 @@ import pytest
 
 from baselines import CheckpointError, PolicyError, check_policy, evaluate, export_policy, make_policy, sb3
 from baselines.__main__ import main
-from baselines.normalisation import read_normalisation
+from baselines.policies.normalisation import read_normalisation
 from quad_envs import formation_v0
 
 stable_baselines3 = pytest.importorskip("stable_baselines3")

@@ -8,11 +8,11 @@ import pytest
 from flights import TASK, at_rest, decide_once, rest, window
 
 from baselines import make_policy
-from baselines.metrics import measure
-from baselines.rollout import run_episodes
+from baselines.evaluation.metrics import measure
+from baselines.evaluation.rollout import run_episodes
 from controllers import LinearMPC, SdcNmpc
 from controllers.model import sdc_matrix
-from controllers.present_axes import body_outputs, pair_in_present_axes
+from controllers.mpc.present_axes import body_outputs, pair_in_present_axes
 from quad_envs.dynamics import derivative_reference
 from quad_envs.parameters import QuadrotorParams
 from quad_envs.rotations import rotation_body_from_inertial

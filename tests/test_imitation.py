@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from baselines import evaluate, make_policy, train
-from baselines.environments import make_env, task_of
+from baselines.policies.environments import make_env, task_of
+from baselines.policies.network import Network, default_features, hover_actions
 from baselines.training.held_out import CHOOSING, HELD_OUT, training_options
 from baselines.training.imitation import DaggerOptions, LabelledFlights, Labels, make_expert
 from baselines.training.imitation import train as dagger
-from baselines.training.networks import Network, default_features, hover_actions
 from baselines.training.policy_gradient import PolicyGradientOptions
 from baselines.training.policy_gradient import train as policy_gradient
 

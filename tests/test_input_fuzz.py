@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from baselines.__main__ import COMMANDS, main
-from baselines.flow import read_value
-from baselines.policy import TEAM_POLICIES, TRACKING_POLICIES, make_policy, policy_options
-from baselines.suite_files import suite_from_dict
+from baselines.cli.values import read_value
+from baselines.policies.registry import TEAM_POLICIES, TRACKING_POLICIES, make_policy, policy_options
+from baselines.sweeps.suite_files import suite_from_dict
 from quad_envs import cooperative_estimation_v0, formation_v0, target_tracking_v0
 
 LONGEST = 2100  # characters of a line that the command line prints

@@ -17,7 +17,7 @@ from stub_training import (
 
 from baselines.__main__ import COMMANDS, main
 from baselines.interruptions import Terminated, exit_code, held, raise_lost, remembered
-from baselines.training.checkpoints import load_checkpoint
+from baselines.policies.checkpoints import load_checkpoint
 from baselines.training.runs import train
 
 HELIX = "quad/HelixTracking-v0"

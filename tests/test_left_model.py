@@ -8,10 +8,10 @@ import pytest
 from flights import DT, HOVER, TASK, at_rest, decide_once, helix, window
 
 from baselines import evaluate, make_policy
-from baselines.metrics import totals
+from baselines.evaluation.metrics import totals
 from controllers import ExactNmpc, Fallback, LinearMPC, SdcNmpc
-from controllers.mpc import EXACT_TILT, PLAN_TILT
-from controllers.mpc_kernels import FROZEN_SPAN, left_model
+from controllers.mpc.kernels import FROZEN_SPAN, left_model
+from controllers.mpc.mpc import EXACT_TILT, PLAN_TILT
 
 N = 15
 HELIX = "quad/HelixTracking-v0"

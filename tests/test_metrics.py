@@ -10,9 +10,16 @@ import pytest
 
 import quad_envs  # noqa: F401  registers the ids
 from baselines import estimate, make_policy, measure, paired_difference, run_episodes
-from baselines.evaluation import Evaluation
-from baselines.metrics import AVERAGED, CUT_SHORT, decision_quantiles, summarize, totals, worst_violations
-from baselines.rollout import Episode
+from baselines.evaluation.evaluate import Evaluation
+from baselines.evaluation.metrics import (
+    AVERAGED,
+    CUT_SHORT,
+    decision_quantiles,
+    summarize,
+    totals,
+    worst_violations,
+)
+from baselines.evaluation.rollout import Episode
 from quad_envs import Limits, Task
 from quad_envs.constraints import constraint_names
 

@@ -18,7 +18,7 @@ from controllers.model import (
     sdc_pair,
     zero_order_hold,
 )
-from controllers.riccati import dare, lqr_gain
+from controllers.qp.riccati import dare, lqr_gain
 from quad_envs.dynamics import derivative_reference
 from quad_envs.parameters import QuadrotorParams
 

@@ -7,8 +7,8 @@ import pytest
 from flights import DT, HOVER, TASK, at_rest, decide_once, fly, helix, jumps, plan_of, window
 
 from controllers import ExactNmpc
-from controllers.nmpc import gauss_newton_weight, rates_residual, velocity_residual
-from controllers.riccati import dare
+from controllers.mpc.exact import gauss_newton_weight, rates_residual, velocity_residual
+from controllers.qp.riccati import dare
 from quad_envs.parameters import Limits
 from quad_envs.rotations import rotation_body_from_inertial
 from quad_envs.tasks import Task

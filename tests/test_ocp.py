@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from ocp_problems import hover_qp, random_qp, tilt_rows, velocity_rows
 
-from controllers.ocp import concatenate_rows, condense, first_move_bounds, no_rows, output_rows, validate
-from controllers.solvers import StructuredSolver, residuals
+from controllers.qp import StructuredSolver, residuals
+from controllers.qp.ocp import concatenate_rows, condense, first_move_bounds, no_rows, output_rows, validate
 
 
 def cost(qp, u):

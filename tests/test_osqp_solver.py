@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from ocp_problems import LIMITS, MODELS, hover_qp, random_qp, velocity_rows
 
-from controllers.ocp import output_rows
-from controllers.solvers import Status, StructuredSolver, residuals
-from controllers.solvers.osqp import OsqpSolver
+from controllers.qp import Status, StructuredSolver, residuals
+from controllers.qp.ocp import output_rows
+from controllers.qp.osqp import OsqpSolver
 
 EXACT = StructuredSolver()
 FAR = np.r_[3.0, 3.0, 3.0, np.zeros(9)]

@@ -22,8 +22,8 @@ from baselines import (
     run_episodes,
 )
 from baselines.__main__ import main
-from baselines.environments import make_env
-from baselines.outside import installed_policies, name_of, names_factory
+from baselines.policies.environments import make_env
+from baselines.policies.outside import installed_policies, name_of, names_factory
 from baselines.training.held_out import HeldOutFlights, training_options
 from quad_envs import formation_v0
 
@@ -100,8 +100,8 @@ import gymnasium
 
 gymnasium.register(
     "lab/Eight-v0",
-    entry_point="quad_envs.envs.tracking:TrackingEnv",
-    vector_entry_point="quad_envs.envs.tracking_vector:TrackingVectorEnv",
+    entry_point="quad_envs.envs.tracking.env:TrackingEnv",
+    vector_entry_point="quad_envs.envs.tracking.vector:TrackingVectorEnv",
     kwargs={"env_id": "lab/Eight-v0", "reference": "lemniscate", "time_limit": 2.0},
 )
 """
@@ -310,11 +310,11 @@ def test_the_command_benchmark_takes_policies_and_ends_with_one_if_some_broke_of
 
 
 def test_policies_from_outside_fly_again_since_their_code_may_have_changed(theirs, folder, monkeypatch):
-    import baselines.sweep
+    import baselines.sweeps.sweep
 
     run_benchmark(SMALL, folder / "out", policies={"mine": "their_policy:make"})
-    flown, real = [], baselines.sweep.fly_unit
-    monkeypatch.setattr(baselines.sweep, "fly_unit", lambda unit: flown.append(unit) or real(unit))
+    flown, real = [], baselines.sweeps.sweep.fly_unit
+    monkeypatch.setattr(baselines.sweeps.sweep, "fly_unit", lambda unit: flown.append(unit) or real(unit))
     run_benchmark(SMALL, folder / "out", policies={"mine": "their_policy:make"})
     assert [unit.policy.title for unit in flown] == ["mine"]
 
@@ -378,7 +378,7 @@ def test_the_options_of_an_environment_named_by_module_and_id_are_those_it_is_re
     assert options.task == task and task.env_id == "lab/Eight-v0"
     flights = HeldOutFlights("their_env:lab/Eight-v0", {"kappa": 0.4})
     assert flights.task == task
-    gym.register("lab/Other-v0", entry_point="quad_envs.envs.tracking:TrackingEnv")
+    gym.register("lab/Other-v0", entry_point="quad_envs.envs.tracking.env:TrackingEnv")
     try:
         with pytest.raises(
             ValueError, match="cannot be trained in: it must be registered with the entry_point"

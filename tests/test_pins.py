@@ -10,7 +10,7 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
-from baselines.doctor import EXTRAS
+from baselines.cli.doctor import EXTRAS
 from quad_envs.extras import install_command
 
 if sys.version_info >= (3, 11):

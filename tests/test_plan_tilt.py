@@ -8,7 +8,7 @@ from flights import at_rest, decide_once, plan_of
 import quad_envs  # noqa: F401  registers the ids
 from baselines import evaluate, make_policy
 from controllers import ExactNmpc, LinearMPC, SdcNmpc
-from controllers.mpc_kernels import leaves_tilt
+from controllers.mpc.kernels import leaves_tilt
 from quad_envs.parameters import Limits
 from quad_envs.tasks import Task
 

@@ -9,8 +9,8 @@ from gymnasium.wrappers import RescaleAction, TransformObservation
 
 import quad_envs  # noqa: F401  registers the ids
 from baselines import PolicyCheckError, PolicyState, check_policy, make_policy, policy_options
-from baselines.policy import TRACKING_POLICIES
-from baselines.tracking import ControllerPolicy, Hover
+from baselines.policies.registry import TRACKING_POLICIES
+from baselines.policies.tracking import ControllerPolicy, Hover
 from controllers.controller import Decision
 from quad_envs.constraints import actions_from_forces
 

@@ -7,7 +7,7 @@ import pytest
 from policy_flights import fly
 
 from baselines import make_policy
-from baselines.policy import TEAM_POLICIES, serving
+from baselines.policies.registry import TEAM_POLICIES, serving
 from controllers.estimation import ekf
 from quad_envs import cooperative_estimation_v0, formation_v0, target_tracking_v0
 

@@ -11,11 +11,11 @@ from ocp_problems import LIMITS, MODELS, random_qp
 
 from baselines import check_policy, make_policy
 from baselines.certify import certify
-from baselines.rollout import run_episodes
+from baselines.evaluation.rollout import run_episodes
 from controllers import ExactNmpc, LinearMPC, SdcNmpc
-from controllers.ocp import condense, first_move_bounds
-from controllers.solvers import Status, StructuredSolver, residuals
-from controllers.solvers.osqp import OsqpSolver
+from controllers.qp import Status, StructuredSolver, residuals
+from controllers.qp.ocp import condense, first_move_bounds
+from controllers.qp.osqp import OsqpSolver
 from quad_envs.parameters import Limits
 from quad_envs.tasks import Task
 

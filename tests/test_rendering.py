@@ -15,10 +15,10 @@ from pettingzoo.test import render_test
 from pettingzoo.utils import parallel_to_aec
 
 from quad_envs import cooperative_estimation_v0, formation_v0, target_tracking_v0
-from quad_envs.canvas import PURPLE, RED, halve
-from quad_envs.envs.tracking_vector import TrackingVectorEnv
+from quad_envs.envs.tracking.vector import TrackingVectorEnv
+from quad_envs.pictures.canvas import PURPLE, RED, halve
+from quad_envs.pictures.scenes import CAMERA, Framing, depth, project
 from quad_envs.registration import TRACKING
-from quad_envs.scenes import CAMERA, Framing, depth, project
 
 TEAMS = [formation_v0, target_tracking_v0, cooperative_estimation_v0]
 HOVER = np.zeros(4, dtype=np.float32)

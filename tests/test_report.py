@@ -11,16 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import baselines.cli.report
 import baselines.report.build
-import baselines.report.commands
 from baselines import ResultsError, run_benchmark
 from baselines.__main__ import main
-from baselines.report import Choice, build_report, read_run, render_report
+from baselines.report import Choice, build_report, render_report
 from baselines.report.flights import BadFlightError, read_flight
 from baselines.report.page import embed, render_page
 from baselines.report.quantise import Blobs, decode, encode
 from baselines.report.shelf import _PER_FLIGHT
-from baselines.sweep import REPORTED
+from baselines.sweeps.folder import read_run
+from baselines.sweeps.sweep import REPORTED
 
 EVIL = "</script><script>alert('{{style}}')</script><!--"
 HELIX, TEAM = "quad/HelixTracking-v0", "team of 3"
@@ -350,14 +351,14 @@ def test_a_folder_that_cannot_be_written_gets_a_line_and_a_way_out(copied, tmp_p
 
 def refuse_writing(monkeypatch, folder):
     """Make a folder read-only for us, who may be root."""
-    real = baselines.results.open if hasattr(baselines.results, "open") else open
+    real = baselines.files.open if hasattr(baselines.files, "open") else open
 
     def refuse(path, mode="r", *rest, **more):
         if "w" in mode and Path(path).is_relative_to(folder):
             raise OSError(30, "Read-only file system", str(path))
         return real(path, mode, *rest, **more)
 
-    monkeypatch.setattr(baselines.results, "open", refuse, raising=False)
+    monkeypatch.setattr(baselines.files, "open", refuse, raising=False)
 
 
 def test_replay_holds_the_chosen_flight_and_opens_it(copied, capsys, monkeypatch):
@@ -375,7 +376,7 @@ def test_replay_holds_the_chosen_flight_and_opens_it(copied, capsys, monkeypatch
 def test_replay_without_a_display_prints_where_the_page_is(copied, capsys, monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(baselines.report.commands.sys, "platform", "linux")
+    monkeypatch.setattr(baselines.cli.report.sys, "platform", "linux")
     refuse_writing(monkeypatch, copied)
     assert main(["replay", str(copied)]) == 0
     printed, said = capsys.readouterr()

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from baselines import run_benchmark
-from baselines.report import Choice, read_run, render_report
+from baselines.report import Choice, render_report
+from baselines.sweeps.folder import read_run
 
 pytestmark = pytest.mark.slow
 

@@ -5,11 +5,11 @@ import re
 
 import pytest
 
-from baselines.reproduce import FIGURE_SECTIONS, ORDER, SECONDS, SECTIONS, reproduce, run, tables
-from baselines.reproduce.published import TABLE_4_1, TABLE_4_2
-from baselines.reproduce.regulation_claims import comparable_claim, instability_claim, saturation_claim
-from baselines.reproduce.results import Cell, Claim, Section, verdict
-from baselines.reproduce.tracking_claims import (
+from baselines.reproduction import FIGURE_SECTIONS, ORDER, SECONDS, SECTIONS, reproduce, run, tables
+from baselines.reproduction.published import TABLE_4_1, TABLE_4_2
+from baselines.reproduction.regulation_claims import comparable_claim, instability_claim, saturation_claim
+from baselines.reproduction.results import Cell, Claim, Section, verdict
+from baselines.reproduction.tracking_claims import (
     disturbance_claim,
     effort_claim,
     norm_claim,

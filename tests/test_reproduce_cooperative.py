@@ -6,12 +6,12 @@ import math
 import numpy as np
 import pytest
 
-from baselines.reproduce import SECTIONS, reproduce
-from baselines.reproduce import formation_claims as formation
-from baselines.reproduce import target_claims as target
-from baselines.reproduce.estimation_claims import azimuth_claim, fix_covariance_claim
-from baselines.reproduce.estimation_scenes import _RING, intersect
-from baselines.reproduce.meetings import (
+from baselines.reproduction import SECTIONS, reproduce
+from baselines.reproduction import formation_claims as formation
+from baselines.reproduction import target_claims as target
+from baselines.reproduction.estimation_claims import azimuth_claim, fix_covariance_claim
+from baselines.reproduction.estimation_scenes import _RING, intersect
+from baselines.reproduction.meetings import (
     fly_led,
     literal_consensus,
     meet,
@@ -19,10 +19,10 @@ from baselines.reproduce.meetings import (
     smallest_gap,
     team_task,
 )
-from baselines.reproduce.results import Claim, Measured, Section
-from baselines.reproduce.scenes import Track, drawn, prior, record
-from baselines.reproduce.team_flights import TeamFlight, TeamOutcome, fly_team, fly_teams
-from controllers.cooperative_mpc import CooperativeMpc
+from baselines.reproduction.results import Claim, Measured, Section
+from baselines.reproduction.scenes import Track, drawn, prior, record
+from baselines.reproduction.team_flights import TeamFlight, TeamOutcome, fly_team, fly_teams
+from controllers.team.cooperative import CooperativeMpc
 from quad_envs.formations import make_formation
 from quad_envs.graphs import has_spanning_tree, make_graph, make_graph_table
 

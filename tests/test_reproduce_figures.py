@@ -11,13 +11,22 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from baselines import reproduce as package
+from baselines import reproduction as package
 from baselines.errors import MissingPackageError, ResultsError
-from baselines.figures import COLOURS
-from baselines.reproduce import FIGURE_SECTIONS, ORDER, SECTIONS, figures, page, run, section_names, sections
-from baselines.reproduce.figures import FIGURES, draw_plate
-from baselines.reproduce.figures.model import OWN, REDRAWN, SHOWN
-from baselines.reproduce.results import Cell, Claim, Measured, Plate, Section
+from baselines.report.figures import COLOURS
+from baselines.reproduction import (
+    FIGURE_SECTIONS,
+    ORDER,
+    SECTIONS,
+    figures,
+    page,
+    run,
+    section_names,
+    sections,
+)
+from baselines.reproduction.figures import FIGURES, draw_plate
+from baselines.reproduction.figures.model import OWN, REDRAWN, SHOWN
+from baselines.reproduction.results import Cell, Claim, Measured, Plate, Section
 
 SKETCHES = {sketch.key: sketch for group in FIGURES.values() for sketch in group}
 EVIL = '<script>alert("x")</script>'

@@ -5,8 +5,8 @@ import pytest
 import scipy.linalg
 from ocp_problems import HOVER, HOVER_P, model_pair
 
-from controllers.linalg import add_matvec_transposed, lu_solve, matmul, matmul_sparse, matvec
-from controllers.riccati import DARE_SCRATCH, dare, lqr_gain, solve_dare
+from controllers.qp.linalg import add_matvec_transposed, lu_solve, matmul, matmul_sparse, matvec
+from controllers.qp.riccati import DARE_SCRATCH, dare, lqr_gain, solve_dare
 
 Q, R = np.eye(12), np.eye(4)
 

@@ -14,8 +14,9 @@ pytest.importorskip("stable_baselines3")
 import torch
 
 from baselines import evaluate
-from baselines.environments import make_env
 from baselines.errors import TrainingError
+from baselines.policies.environments import make_env
+from baselines.policies.network import NetworkPolicy, hover_actions
 from baselines.training.lagrangian import (
     CostCritic,
     LagrangianBuffer,
@@ -25,7 +26,6 @@ from baselines.training.lagrangian import (
     cost_advantages,
 )
 from baselines.training.learner import RowBuffer, Tanh
-from baselines.training.networks import NetworkPolicy, hover_actions
 from baselines.training.sb3 import (
     PpoLagrangianOptions,
     PpoOptions,
@@ -39,10 +39,10 @@ from baselines.training.sb3 import (
     train_sac,
 )
 from baselines.training.vec_env import TrainingVecEnv
-from quad_envs.envs.options import TrackingOptions
-from quad_envs.envs.team_options import EstimationOptions, FormationOptions, TargetTrackingOptions
-from quad_envs.envs.team_vector import TeamVectorEnv
-from quad_envs.envs.tracking_vector import TrackingVectorEnv
+from quad_envs.envs.team.options import EstimationOptions, FormationOptions, TargetTrackingOptions
+from quad_envs.envs.team.vector import TeamVectorEnv
+from quad_envs.envs.tracking.options import TrackingOptions
+from quad_envs.envs.tracking.vector import TrackingVectorEnv
 from quad_envs.registration import TRACKING
 
 SHORT = {"reference": "random", "time_limit": 1.0, "preview": 3}

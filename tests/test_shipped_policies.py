@@ -5,7 +5,7 @@ import json
 import pytest
 
 from baselines import make_policy, shipped_policies
-from baselines.trained import SHIPPED, shipped_name
+from baselines.policies.trained import SHIPPED, shipped_name
 from baselines.training.shipping import judged
 from quad_envs.registration import TRACKING
 

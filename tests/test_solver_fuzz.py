@@ -3,7 +3,7 @@
 import pytest
 
 from benchmarks.solver import FAMILIES, is_soft, judge
-from controllers.solvers import Status
+from controllers.qp import Status
 
 
 def nothing_false_is_said(number, seed):

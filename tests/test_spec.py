@@ -11,7 +11,7 @@ from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
 
 from baselines import evaluate, make_policy, run_episodes
 from quad_envs import Gusts, Heading, Helix, from_function
-from quad_envs.envs.tracking import TrackingEnv
+from quad_envs.envs.tracking.env import TrackingEnv
 from quad_envs.registration import NMPC_SCORES, TRACKING
 
 HELIX = "quad/HelixTracking-v0"

@@ -5,12 +5,12 @@ import re
 import pytest
 
 from baselines.__main__ import main
-from baselines.policy import TRACKING_POLICIES
-from baselines.stages import SweepProgress, compile_for, price, said_left, said_seconds
-from baselines.suite import PolicyChoice
-from baselines.suite_files import load_suite
-from baselines.sweep import Order, Sweep
-from baselines.units import suite_units
+from baselines.policies.registry import TRACKING_POLICIES
+from baselines.sweeps.stages import SweepProgress, compile_for, price, said_left, said_seconds
+from baselines.sweeps.suite import PolicyChoice
+from baselines.sweeps.suite_files import load_suite
+from baselines.sweeps.sweep import Order, Sweep
+from baselines.sweeps.units import suite_units
 
 SUITE = """
 episodes = 1

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu, trim_mean
 
-from baselines.statistics import compare, interquartile_mean
+from baselines.evaluation.statistics import compare, interquartile_mean
 
 
 def test_the_interquartile_mean_is_scipys_trimmed_mean():

@@ -7,10 +7,17 @@ import numpy as np
 import pytest
 from ocp_problems import LIMITS, MODELS, hover_qp, random_qp, tilt_rows, velocity_rows
 
-from controllers.ocp import StateRows, concatenate_rows, condense, first_move_bounds, output_rows, rate_weight
-from controllers.riccati import RICCATI_SCRATCH, optimal_plan, riccati_pass
-from controllers.solvers import Status, StructuredSolver, residuals
-from controllers.solvers.structured import inverse_factor, make_workspace, solve_structured
+from controllers.qp import Status, StructuredSolver, residuals
+from controllers.qp.ocp import (
+    StateRows,
+    concatenate_rows,
+    condense,
+    first_move_bounds,
+    output_rows,
+    rate_weight,
+)
+from controllers.qp.riccati import RICCATI_SCRATCH, optimal_plan, riccati_pass
+from controllers.qp.structured import inverse_factor, make_workspace, solve_structured
 
 SOLVER = StructuredSolver()
 FAR = np.r_[3.0, 3.0, 3.0, np.zeros(9)]

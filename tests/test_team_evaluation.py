@@ -8,20 +8,21 @@ import pickle
 
 import numpy as np
 import pytest
+from baselines.evaluation.record import TEAM_COLUMNS, Record
 
 from baselines import evaluate, load_suite, make_policy, measure, run_benchmark, run_episodes
 from baselines.__main__ import main
-from baselines.comparison import Results
-from baselines.environments import make_env, task_of
-from baselines.episode import Episode
-from baselines.estimate_wrapper import EstimateWrapper
-from baselines.evaluation import Evaluation
-from baselines.metrics import Record, estimate, paired_difference, summarize, totals
-from baselines.policy import Estimates, PolicyState
-from baselines.suite_files import suite_from_dict
-from baselines.team_metrics import TEAM_COLUMNS, flight_values
-from baselines.unit_flights import flight_arrays
-from baselines.units import suite_units
+from baselines.evaluation.episode import Episode
+from baselines.evaluation.evaluate import Evaluation
+from baselines.evaluation.metrics import estimate, paired_difference, summarize, totals
+from baselines.evaluation.team_metrics import flight_values
+from baselines.policies.environments import make_env, task_of
+from baselines.policies.estimate_wrapper import EstimateWrapper
+from baselines.policies.protocol import Estimates, PolicyState
+from baselines.sweeps.comparison import Results
+from baselines.sweeps.suite_files import suite_from_dict
+from baselines.sweeps.unit_flights import flight_arrays
+from baselines.sweeps.units import suite_units
 from quad_envs import cooperative_estimation_v0, formation_v0, target_tracking_v0
 from quad_envs.registration import TEAMS
 from quad_envs.tasks import TeamTask

@@ -28,7 +28,7 @@ from formation_flights import (
 )
 
 from baselines import make_policy
-from controllers.cooperative_mpc import CooperativeMpc
+from controllers.team.cooperative import CooperativeMpc
 from quad_envs import formation_v0
 from quad_envs.dynamics import simulate
 from quad_envs.formations import make_formation, start_positions

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from baselines import make_policy
-from baselines.reproduce.meetings import meet
-from controllers.collision import AvoidanceOptions, time_to_stop
-from controllers.cooperative_kernels import turning_velocity
-from controllers.cooperative_mpc import CooperativeMpc
+from baselines.reproduction.meetings import meet
+from controllers.team.collision import AvoidanceOptions, time_to_stop
+from controllers.team.cooperative import CooperativeMpc
+from controllers.team.cooperative_kernels import turning_velocity
 from quad_envs import formation_v0, target_tracking_v0
 from quad_envs.rotations import rotation_body_from_inertial
 

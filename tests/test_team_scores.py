@@ -5,7 +5,7 @@ import pytest
 
 from quad_envs import Helix, formation_v0, target_tracking_v0
 from quad_envs.constraints import TOLERANCE, forces_from_actions
-from quad_envs.envs.vehicle_options import CRASH_TILT
+from quad_envs.envs.shared.vehicle_options import CRASH_TILT
 from quad_envs.reward import stage_cost
 
 TILT = 0.4

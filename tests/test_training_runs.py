@@ -13,11 +13,11 @@ from stub_training import stubs  # noqa: F401
 
 from baselines import CheckpointError, ResultsError, TrainingError, evaluate, make_policy, train
 from baselines.__main__ import main
+from baselines.cli.options import TrainOptions
+from baselines.cli.train import resume_command
 from baselines.errors import MissingPackageError
-from baselines.options import TrainOptions
-from baselines.results import locked
-from baselines.train_command import resume_command
-from baselines.training import load_checkpoint
+from baselines.files import locked
+from baselines.policies.checkpoints import load_checkpoint
 from baselines.training.algorithms import ALGORITHMS, options_of
 from baselines.training.clock import Budget
 from baselines.training.held_out import CHOOSING, Point, better, training_options
@@ -146,7 +146,7 @@ def test_a_full_disk_keeps_what_was_saved_and_is_said_at_the_end(tmp_path, monke
     def full(path, data):
         raise ResultsError("No space left on device")
 
-    monkeypatch.setattr("baselines.training.checkpoints.write_atomic", full)
+    monkeypatch.setattr("baselines.policies.checkpoints.write_atomic", full)
     with pytest.raises(CheckpointError, match="No space left"):
         run(tmp_path, steps=1500, resume=True, watcher=Watch("x", io.StringIO()))
     assert (tmp_path / "last" / "network.safetensors").read_bytes() == before

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from quad_envs.envs.kernel import BLOCK_FROM
+from quad_envs.envs.tracking.kernel import BLOCK_FROM
 from quad_envs.registration import TRACKING
 
 RANDOM = {

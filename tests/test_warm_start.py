@@ -7,10 +7,10 @@ from ocp_problems import LIMITS, MODELS, random_qp
 
 import quad_envs  # noqa: F401  registers the ids
 from baselines import check_policy, make_policy
-from controllers.ocp import rate_weight
-from controllers.solvers import Status, StructuredSolver
-from controllers.solvers.structured import ITERATION_LIMIT, make_workspace, solve_structured, step_limit
-from controllers.solvers.working_set import DIGITS, pack_working_set, unpack_working_set
+from controllers.qp import Status, StructuredSolver
+from controllers.qp.ocp import rate_weight
+from controllers.qp.structured import ITERATION_LIMIT, make_workspace, solve_structured, step_limit
+from controllers.qp.working_set import DIGITS, pack_working_set, unpack_working_set
 
 SOLVER = StructuredSolver()
 

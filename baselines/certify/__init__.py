@@ -7,22 +7,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from controllers.certificates import Decrease, linear_matrix_inequality, terminal_decrease
-from controllers.invariant import (
+from controllers.model import hover_pair
+from controllers.qp.riccati import lqr_gain
+from controllers.stability.certificates import Decrease, linear_matrix_inequality, terminal_decrease
+from controllers.stability.invariant import (
     Ellipsoid,
     Halfspaces,
     inscribed_ellipsoid,
     largest_ellipsoid,
     law_halfspaces,
 )
-from controllers.model import hover_pair
-from controllers.riccati import lqr_gain
 from quad_envs.checks import require_whole
 from quad_envs.parameters import Array
 
-from ..environments import make_env
-from ..policy import TRACKING_POLICIES, is_trained, make_policy, policy_options
-from ..results import plain_json
+from ..files import plain_json
+from ..policies.environments import make_env
+from ..policies.registry import TRACKING_POLICIES, is_trained, make_policy, policy_options
 from . import verdicts
 from .flight import Trace, fly
 from .region import Stay, linear_stay, random_starts, shrunk_stay

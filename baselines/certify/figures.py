@@ -9,7 +9,7 @@ import numpy as np
 
 from quad_envs.parameters import N_STATE, Array
 
-from ..figures import COLOURS, ellipse, house_style, new_figure, save_figure
+from ..report.figures import COLOURS, ellipse, house_style, new_figure, save_figure
 from . import _INSCRIBED, _LARGEST, Region, Report
 from .flight import Trace
 from .verdicts import descent

@@ -6,7 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from controllers.certificates import (
+from controllers.qp import StructuredSolver
+from controllers.qp.ocp import OcpQp
+from controllers.qp.riccati import lqr_gain
+from controllers.stability.certificates import (
     best_gain,
     plan_cost,
     predicted_state,
@@ -15,9 +18,6 @@ from controllers.certificates import (
     terminal_decrease,
     terminal_rows,
 )
-from controllers.ocp import OcpQp
-from controllers.riccati import lqr_gain
-from controllers.solvers import StructuredSolver
 from quad_envs.parameters import POSITION, Array
 from quad_envs.rotations import wrap_angle
 

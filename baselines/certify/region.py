@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from controllers.invariant import Ellipsoid, Halfspaces, sample_ellipsoid
+from controllers.stability.invariant import Ellipsoid, Halfspaces, sample_ellipsoid
 from quad_envs.dynamics import simulate
-from quad_envs.observations import N_REFERENCE
+from quad_envs.observations.tracking import N_REFERENCE
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 
 STEPS = 400  # 20 s at the usual control period: the slowest mode of hover decays to 1 %

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.certificates import Decrease
-from controllers.invariant import Ellipsoid
+from controllers.stability.certificates import Decrease
+from controllers.stability.invariant import Ellipsoid
 from quad_envs.parameters import Array
 
 from .flight import Trace

@@ -6,8 +6,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ..sweeps.folder import Run, read_run
     from .build import Choice, build_report, render_report
-    from .folder import Run, read_run
     from .page import render_page
 
 _PUBLIC = {

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from baselines.errors import ResultsError
-from baselines.evaluation import NO_SPANNING_TREE
+from baselines.evaluation.evaluate import NO_SPANNING_TREE
 from quad_envs.names import unknown_name
 
-from .folder import Finished, Run, read_contenders
+from ..sweeps.folder import Finished, Run, read_contenders
 from .leaderboard import contender_board, leaderboard
 from .model import PAGE_FORMAT, Environment, Report
 from .page import render_page

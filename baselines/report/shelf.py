@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from baselines.metrics import Record
+from baselines.evaluation.record import Record
 
+from ..sweeps.folder import Finished
 from .flights import BadFlightError, read_flight
-from .folder import Finished
 from .model import Flight
 from .quantise import Blobs
 

@@ -11,8 +11,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .checkpoints import load_checkpoint, save_checkpoint
-    from .networks import Features, Network, NetworkPolicy
+    from ..policies.checkpoints import load_checkpoint, save_checkpoint
+    from ..policies.network import Features, Network, NetworkPolicy
 
 # Public name -> module; loaded at first use, so that evaluating a network loads no torch.
 _PUBLIC = {

@@ -10,7 +10,7 @@ from quad_envs.checks import require_memory, require_whole
 from quad_envs.names import shown
 
 if TYPE_CHECKING:
-    from .networks import Squash
+    from ..policies.network import Squash
 
 _POSITIVE = (
     *("rows", "horizon", "batch", "epochs", "learning_rate", "final_rate", "discount", "clip"),

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from quad_envs.envs.options import TrackingOptions
-from quad_envs.envs.team_options import TeamOptions
+from quad_envs.envs.team.options import TeamOptions
+from quad_envs.envs.tracking.options import TrackingOptions
 from quad_envs.graphs import in_neighbours
 from quad_envs.names import shown
 
-from .networks import Features, default_features
+from ..policies.network import Features, default_features
 
 
 def training_features(

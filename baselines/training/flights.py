@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_envs.adjoint import SCRATCH_ROWS
-from quad_envs.envs.adjoint import action_slopes, tracking_vjp_rows
-from quad_envs.envs.batch import TrackingBatch
-from quad_envs.envs.kernel import (
+from quad_envs.envs.tracking.adjoint import action_slopes, tracking_vjp_rows
+from quad_envs.envs.tracking.batch import TrackingBatch
+from quad_envs.envs.tracking.kernel import (
     COEFFICIENTS,
     COMMAND,
     CRASHED,
@@ -25,11 +25,11 @@ from quad_envs.envs.kernel import (
     TRUNCATED,
     task_vector,
 )
-from quad_envs.envs.options import TrackingOptions
-from quad_envs.observations import N_REFERENCE
+from quad_envs.envs.tracking.options import TrackingOptions
+from quad_envs.observations.tracking import N_REFERENCE
 from quad_envs.parameters import Array
 
-from .networks import Features, default_features, preview_stages
+from ..policies.network import Features, default_features, preview_stages
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float32]

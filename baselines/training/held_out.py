@@ -17,9 +17,9 @@ import numpy as np
 from quad_envs.names import unknown_name
 from quad_envs.registration import ENTRY, TEAMS, TRACKING, VECTOR_ENTRY
 
-from ..evaluation import fly_and_measure
-from ..outside import import_named
-from .networks import Network, NetworkPolicy
+from ..evaluation.evaluate import fly_and_measure
+from ..policies.network import Network, NetworkPolicy
+from ..policies.outside import import_named
 
 HELD_OUT = 10_000  # the first environment seed that training must not use
 CHOOSING = 20_000  # the first of those that choose the best policy
@@ -72,7 +72,7 @@ def training_options(env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
     try:
         if name in TEAMS:
             return import_module(TEAMS[name]).raw_env.options_type.from_kwargs(env_kwargs)
-        from quad_envs.envs.options import TrackingOptions
+        from quad_envs.envs.tracking.options import TrackingOptions
 
         if name in TRACKING:
             return TrackingOptions.from_kwargs({"env_id": name, **TRACKING[name], **env_kwargs})

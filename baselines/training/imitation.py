@@ -13,20 +13,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from quad_envs.envs.options import TrackingOptions
-from quad_envs.envs.team_options import TeamOptions
-from quad_envs.envs.team_vector import TeamVectorEnv
-from quad_envs.envs.tracking_vector import TrackingVectorEnv
+from quad_envs.envs.team.options import TeamOptions
+from quad_envs.envs.team.vector import TeamVectorEnv
+from quad_envs.envs.tracking.options import TrackingOptions
+from quad_envs.envs.tracking.vector import TrackingVectorEnv
 from quad_envs.names import shown
 from quad_envs.tasks import BaseTask, TeamTask
 
 from ..errors import TrainingError
-from ..policy import Policy, make_policy, mission_of
-from ..rollout import is_privileged
+from ..evaluation.rollout import is_privileged
+from ..policies.network import Floats, Network, NetworkPolicy, hover_outputs
+from ..policies.protocol import Policy
+from ..policies.registry import make_policy, mission_of
 from .algorithm_options import DaggerOptions
 from .features import training_features
 from .held_out import Progress
-from .networks import Floats, Network, NetworkPolicy, hover_outputs
 from .policy_gradient import Actor
 
 if TYPE_CHECKING:

@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
+from ..policies.network import Floats
 from .learner import RowBuffer, Tanh
-from .networks import Floats
 from .vec_env import Bools, TrainingVecEnv
 
 _LAYERS = (64, 64)

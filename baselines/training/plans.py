@@ -10,16 +10,16 @@ from typing import Any, NamedTuple
 from quad_envs.names import shown
 
 from ..errors import ResultsError
-from ..policy import mission_of
-from ..trained import checkpoint_folder
+from ..policies.checkpoints import load_checkpoint
+from ..policies.network import Network
+from ..policies.registry import mission_of
+from ..policies.trained import checkpoint_folder
 from .algorithm_options import check_sizes
 from .algorithms import algorithm_for, require_packages, require_resumable
-from .checkpoints import load_checkpoint
 from .clock import Budget
 from .command_line import assignments, training_command
 from .held_out import Point, read_point, training_options
 from .hyperparameters import hyperparameters, plain_options
-from .networks import Network
 from .run_folder import RunFolder
 
 _ORIGIN = ("env_id", "algorithm", "seed", "steps", "digest")  # what is said of a network to begin with

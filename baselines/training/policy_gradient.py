@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from quad_envs.envs.options import TrackingOptions
+from quad_envs.envs.tracking.options import TrackingOptions
 
 from ..errors import TrainingError
+from ..policies.network import Features, Floats, Network, Squash, hover_actions, hover_slopes
 from .algorithm_options import PolicyGradientOptions
 from .flights import DifferentiableFlights
 from .held_out import Progress
-from .networks import Features, Floats, Network, Squash, hover_actions, hover_slopes
 
 
 class Actor:

@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import CheckpointError, ResultsError
-from ..results import plain_json, provenance, read_json, write_atomic, write_csv
-from .checkpoints import DESCRIPTION, WEIGHTS, load_checkpoint, save_checkpoint
+from ..files import plain_json, provenance, read_json, write_atomic, write_csv
+from ..policies.checkpoints import DESCRIPTION, WEIGHTS, load_checkpoint, save_checkpoint
+from ..policies.network import Network
 from .held_out import Point, read_point
-from .networks import Network
 
 _IDENTITY = ("env_id", "env_kwargs", "algorithm", "seed", "hyperparameters")  # a resumed run must agree
 _ORIGIN = "start_from"  # and this, which older runs do not say

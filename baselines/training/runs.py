@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import CheckpointError, ResultsError, TrainingError
+from ..files import locked
 from ..interruptions import held, raise_lost, remembered
-from ..results import locked
+from ..policies.network import Network
 from .algorithms import generator_of, require_resumable
 from .clock import TrainingClock
 from .held_out import CHOOSING, HeldOutFlights, Point, Progress, better
-from .networks import Network
 from .plans import Plan, Start, make_plan, read_start
 from .run_folder import RunFolder
 from .watching import Watcher, tensorboard_log

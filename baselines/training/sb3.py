@@ -17,15 +17,15 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
 
-from quad_envs.envs.team_options import TeamOptions
+from quad_envs.envs.team.options import TeamOptions
 
 from ..errors import TrainingError
+from ..policies.network import Features, Network
 from .algorithm_options import PpoLagrangianOptions, PpoOptions, SacOptions
 from .features import training_features
 from .held_out import Progress
 from .lagrangian import LagrangianBuffer, LagrangianEnv, Multiplier, Probe
 from .learner import RowBuffer, Tanh
-from .networks import Features, Network
 from .vec_env import TaskOptions, TrainingVecEnv
 
 _PROBES = 500_000_009  # from the seed of training to that of the flights which measure violations

@@ -10,9 +10,9 @@ import shutil
 import sys
 from pathlib import Path
 
-from ..results import read_json
-from ..trained import SHIPPED
-from .checkpoints import load_checkpoint, save_checkpoint
+from ..files import read_json
+from ..policies.checkpoints import load_checkpoint, save_checkpoint
+from ..policies.trained import SHIPPED
 from .held_out import HELD_OUT, HeldOutFlights, Point, Progress
 
 _SAID = (

@@ -17,15 +17,15 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from quad_envs.envs.batch import TrackingBatch
-from quad_envs.envs.kernel import COST, CRASHED, REWARD, TRUNCATED, VIOLATED
-from quad_envs.envs.options import TrackingOptions
-from quad_envs.envs.team_batch import TeamBatch
-from quad_envs.envs.team_options import TeamOptions
+from quad_envs.envs.team.batch import TeamBatch
+from quad_envs.envs.team.options import TeamOptions
+from quad_envs.envs.tracking.batch import TrackingBatch
+from quad_envs.envs.tracking.kernel import COST, CRASHED, REWARD, TRUNCATED, VIOLATED
+from quad_envs.envs.tracking.options import TrackingOptions
 from quad_envs.names import shown
 from quad_envs.tasks import Task, TeamTask
 
-from .networks import Features, Floats, default_features, hover_actions
+from ..policies.network import Features, Floats, default_features, hover_actions
 
 Bools = NDArray[np.bool_]
 TaskOptions = TrackingOptions | TeamOptions

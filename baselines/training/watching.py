@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol
 
-from ..table import format_number
+from ..evaluation.table import format_number
 from .held_out import Point
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from controllers.linalg import copy, fill, invert_spd, matvec
+from controllers.qp.linalg import copy, fill, invert_spd, matvec
 from quad_envs._numba import Int, kernel
 from quad_envs.parameters import Array
 

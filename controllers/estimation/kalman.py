@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from controllers.linalg import cholesky, matmul, solve_lower, solve_lower_transposed, symmetrise
+from controllers.qp.linalg import cholesky, matmul, solve_lower, solve_lower_transposed, symmetrise
 from quad_envs._numba import kernel
 from quad_envs.parameters import Array
 

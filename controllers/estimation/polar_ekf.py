@@ -17,7 +17,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from controllers.linalg import matmul, symmetrise
+from controllers.qp.linalg import matmul, symmetrise
 from quad_envs._numba import Int, kernel
 from quad_envs.names import unknown_name
 from quad_envs.parameters import Array

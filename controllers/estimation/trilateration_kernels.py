@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from controllers.linalg import cholesky, copy, fill, invert_spd, solve_lower, solve_lower_transposed
+from controllers.qp.linalg import cholesky, copy, fill, invert_spd, solve_lower, solve_lower_transposed
 from quad_envs._numba import kernel
 from quad_envs.parameters import Array
 

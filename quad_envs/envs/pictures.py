@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 from ..constraints import TOLERANCE
 from ..names import shown
 from ..parameters import POSITION, VELOCITY, Array
-from ..scenes import Framing, Scene
+from ..pictures.scenes import Framing, Scene
+from ..pictures.window import Window
 from ..tasks import Task, TeamTask
-from ..window import Window
-from .batch import TrackingBatch
-from .exchange import ALIVE, MEASURES, NEAREST, SENT, SLOT_ERROR, WEIGHT
-from .kernel import CRASHED, PLANT, REWARD, STEP, TRUNCATED, VALUES, VIOLATED
-from .team_batch import TeamBatch
-from .team_kernel import ESTIMATE_REACH, ESTIMATE_SPEED
-from .team_options import EstimationOptions
+from .team.batch import TeamBatch
+from .team.exchange import ALIVE, MEASURES, NEAREST, SENT, SLOT_ERROR, WEIGHT
+from .team.kernel import ESTIMATE_REACH, ESTIMATE_SPEED
+from .team.options import EstimationOptions
+from .tracking.batch import TrackingBatch
+from .tracking.kernel import CRASHED, PLANT, REWARD, STEP, TRUNCATED, VALUES, VIOLATED
 
 _TRAIL = 3.0  # s
 _UNITS = {"tilt": "rad", "velocity": "m/s", "position": "m", "rate": "N", "separation": "m"}
@@ -120,7 +120,7 @@ class Pictures:
         Raises:
             ResetNeeded: If no episode has begun.
         """
-        from ..rendering import render
+        from ..pictures.rendering import render
 
         return render(self.scene(), *self.size)
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import require_whole
 from ..names import shown
-from ..observations import N_REFERENCE
+from ..observations.tracking import N_REFERENCE
 from ..parameters import Array
 from .plausible import FASTEST
 

@@ -1,0 +1,248 @@
+"""What the commands `list`, `evaluate` and `benchmark` do."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from datetime import datetime
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from quad_envs.names import shortened, unknown_name
+
+from ..interruptions import exit_code, raise_lost
+from .options import BenchmarkOptions, EvaluateOptions, ListOptions, read_assignments
+
+_FAILED = 1  # a policy from outside broke off
+
+# What the multi-agent environments are, for `list`, which loads none of them.
+TEAM_KINDS = {
+    "quad/Formation-v0": "formation: quadrotors take and keep their slots behind a leader",
+    "quad/TargetTracking-v0": "target-tracking: quadrotors keep their slots beside a target they measure",
+    "quad/CooperativeEstimation-v0": "estimation: vehicles on rails estimate the motion of a target",
+}
+
+
+def say(text: str) -> None:
+    """A line for the person at the terminal; results alone go to stdout."""
+    print(text, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def progress(total: int, unit: str) -> Iterator[Any]:
+    """A progress bar on a terminal, nothing in a pipe."""
+    from tqdm import tqdm
+
+    with tqdm(total=total, unit=unit, file=sys.stderr, disable=None, leave=False) as bar:
+        yield bar
+
+
+@contextmanager
+def plain_warnings() -> Iterator[None]:
+    """Print what an environment warns of as one line on stderr, each text once."""
+    said: set[str] = set()
+
+    def show(message: Warning | str, *details: Any, **more: Any) -> None:
+        text = shortened(str(message))
+        if text not in said:
+            said.add(text)
+            say(f"quad-envs: warning: {text}")
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = show
+        yield
+
+
+def list_names(options: ListOptions) -> int:
+    """Print what there is, or the options of one environment or policy."""
+    from quad_envs.registration import TRACKING
+    from quad_envs.vehicles import VEHICLES
+
+    from ..policies.outside import installed_policies
+    from ..policies.registry import TEAM_POLICIES, TRACKING_POLICIES
+    from ..policies.trained import shipped_policies
+    from ..sweeps.suite_files import suite_names
+
+    if options.name:
+        return _list_options(options)
+    policies = {name: entry.description for name, entry in TRACKING_POLICIES.items()}
+    team = {
+        name: f"{entry.description}; for {', '.join(entry.missions)}{' (privileged)' * entry.privileged}"
+        for name, entry in TEAM_POLICIES.items()
+    }
+    vehicles = {
+        name: f"{vehicle.about}, thrust-to-weight {vehicle.thrust_to_weight:.2g} ({vehicle.source})"
+        for name, vehicle in VEHICLES.items()
+    }
+    if options.json:
+        found = {"environments": TRACKING, "team_environments": TEAM_KINDS, "vehicles": vehicles}
+        print(
+            json.dumps(
+                found
+                | {
+                    "policies": policies,
+                    "team_policies": team,
+                    "trained_policies": shipped_policies(),
+                    "installed_policies": installed_policies(),
+                    "suites": suite_names(),
+                },
+                indent=1,
+            )
+        )
+        return 0
+    envs = {
+        name: ", ".join(f"{key}={value!r}" for key, value in kwargs.items())
+        for name, kwargs in TRACKING.items()
+    }
+    for title, entries in (
+        ("environments of one vehicle (Gymnasium)", envs),
+        ("environments of several vehicles (PettingZoo)", TEAM_KINDS),
+        ("vehicles: --set vehicle=NAME", vehicles),
+        ("policies for one vehicle", policies),
+        ("policies for several vehicles", team),
+        ("trained policies", shipped_policies() or {"-": "none; quad-envs train ENV ALGORITHM makes one"}),
+        ("policies of other packages", installed_policies()),
+        ("suites", suite_names()),
+    ):
+        if not entries:
+            continue
+        print(title)
+        for name, text in entries.items():
+            print(f"  {name:28} {text}")
+    print("\nquad-envs list NAME shows the options of an environment or a policy")
+    return 0
+
+
+def _list_options(options: ListOptions) -> int:
+    from dataclasses import fields
+
+    from quad_envs.registration import TEAMS, TRACKING
+
+    from ..policies.outside import installed_policies
+    from ..policies.registry import TEAM_POLICIES, TRACKING_POLICIES, from_outside, policy_options
+
+    names = [*TRACKING, *TEAMS, *TRACKING_POLICIES, *TEAM_POLICIES, *installed_policies()]
+    if options.name in (*TRACKING, *TEAMS):
+        if options.name in TEAMS:
+            kind = import_module(TEAMS[options.name]).raw_env.options_type
+        else:
+            from quad_envs.envs.tracking.options import TrackingOptions as kind
+        values = {entry.name: entry.default for entry in fields(kind) if entry.init}
+        values |= TRACKING.get(options.name, {})
+        del values["env_id"]
+        flag = "--set"
+    elif options.name in names or from_outside(options.name):
+        values, flag = policy_options(options.name), "--policy-set"
+    else:
+        raise ValueError(unknown_name("name", options.name, names))
+    if options.json:
+        print(json.dumps(values, indent=1, default=str))
+        return 0
+    print(f"options of {options.name} and their defaults; on the command line {flag} KEY=VALUE")
+    for name, value in values.items():
+        print(f"  {name:20} {value!r}")
+    return 0
+
+
+def evaluate_one(options: EvaluateOptions) -> int:
+    """Fly one policy in one environment and print the numbers."""
+    from ..benchmark import run_benchmark
+    from ..evaluation.evaluate import fly_and_measure
+    from ..policies.environments import make_env
+    from ..policies.registry import make_policy, policy_name
+    from ..sweeps.suite import EnvChoice, PolicyChoice, Suite
+
+    env_kwargs = read_assignments("--set", options.set)
+    policy_kwargs = read_assignments("--policy-set", options.policy_set)
+    for flag, given in (("--save-episodes", options.save_episodes), ("--fresh", options.fresh)):
+        if given and options.out is None:
+            raise ValueError(f"{flag} needs a folder: --out FOLDER")
+    if options.out is not None:
+        choices = (EnvChoice(options.env, env_kwargs),), (PolicyChoice(options.policy, policy_kwargs),)
+        suite = Suite("evaluate", *choices, options.episodes, options.seed)
+        with plain_warnings():
+            results = run_benchmark(
+                suite, options.out, save_episodes=options.save_episodes, fresh=options.fresh
+            )
+        found = results.evaluations[0]
+        _say_where(options.out)
+    else:
+        with plain_warnings():
+            env = make_env(options.env, **env_kwargs)
+        policy = make_policy(options.policy, env, **policy_kwargs)
+        with progress(options.episodes, "flight") as bar:
+            count = lambda episode: bar.update(episode.seed - options.seed + 1 - bar.n)  # noqa: E731
+            found = fly_and_measure(policy, env, options.episodes, options.seed, on_episode=count)
+        found = replace(found, policy=policy_name(policy, options.policy))
+    print(json.dumps(found.to_dict(), indent=1, allow_nan=False) if options.json else found)
+    return 0
+
+
+def benchmark_suite(options: BenchmarkOptions) -> int:
+    """Fly a suite, print its tables, and leave a results folder."""
+    from ..benchmark import fly_suite
+    from ..sweeps.stages import SweepProgress
+    from ..sweeps.suite import PolicyChoice
+    from ..sweeps.suite_files import load_suite
+    from ..sweeps.sweep import Order
+
+    suite = load_suite(options.suite)
+    changes = {
+        name: getattr(options, name) for name in ("episodes", "seed") if getattr(options, name) is not None
+    }
+    suite = replace(suite.quick() if options.quick else suite, **changes)
+    suite = replace(suite, policies=(*suite.policies, *map(PolicyChoice, options.policy)))
+    out = options.out or Path("runs") / f"{suite.name}-{datetime.now():%Y%m%d-%H%M%S}"
+    finished, watcher = 0, SweepProgress()
+
+    def on_unit(count: int, total: int) -> None:
+        nonlocal finished
+        finished = count
+        raise_lost()
+
+    order = Order(
+        options.engine,
+        options.jobs,
+        options.save_episodes,
+        options.fresh,
+        options.networks,
+        on_unit,
+        watcher,
+    )
+    with plain_warnings():
+        try:
+            results = fly_suite(suite, {}, out, order)
+        except KeyboardInterrupt as interruption:
+            say(f"interrupted; {finished} units are stored. Resume with: {_resume(options, out)}")
+            return exit_code(interruption)
+        finally:
+            watcher.close()
+    print(json.dumps(results.to_dict(), indent=1, allow_nan=False) if options.json else results)
+    _say_where(out)
+    return _FAILED if results.failures else 0
+
+
+def _say_where(out: Path) -> None:
+    say(f"results in {out}")
+    say(f"report: {out / 'report.html'}")
+
+
+def _resume(options: BenchmarkOptions, out: Path) -> str:
+    words = ["quad-envs benchmark", shlex.quote(options.suite), f"--out {shlex.quote(str(out))}"]
+    for name in ("episodes", "seed"):
+        value = getattr(options, name)
+        words += [] if value is None else [f"--{name} {value}"]
+    words += [f"--policy {shlex.quote(name)}" for name in options.policy]
+    words += [f"--engine {options.engine}"] if options.engine != "processes" else []
+    words += [f"--jobs {options.jobs}"] if options.jobs != 1 else []
+    words += ["--quick"] if options.quick else []
+    words += [f"--networks {shlex.quote(str(options.networks))}"] if options.networks else []
+    words += ["--save-episodes"] if options.save_episodes else []
+    return " ".join(words)

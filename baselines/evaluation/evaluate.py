@@ -1,0 +1,235 @@
+"""One policy in one environment, or one team of its vehicles, over several starts: what it is worth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from quad_envs.tasks import BaseTask, TeamTask
+
+from ..files import plain_json
+from ..policies.environments import make_env
+from ..policies.outside import is_policy
+from ..policies.protocol import Policy
+from ..policies.registry import make_policy, policy_name
+from .metrics import (
+    AVERAGED,
+    CUT_SHORT,
+    Estimate,
+    crash_causes,
+    decision_quantiles,
+    measure,
+    said_causes,
+    summarize,
+    totals,
+    worst_violations,
+)
+from .record import TEAM_COLUMNS, Record
+from .rollout import Episode, is_privileged, run_episodes
+from .table import Table, format_number
+from .team_metrics import TEAM_CUT_SHORT, by_flight, flight_values, has_team
+
+_UNITS = {
+    "score": "-",
+    "cost": "-",
+    "position_rms": "m",
+    "steady_rms": "m",
+    "effort": "N^2",
+    "settling_time": "s",
+    "violation_share": "-",
+    "saturation_share": "-",
+    **TEAM_COLUMNS,
+}
+_NOT_TIMED = (math.nan, math.nan, math.nan)
+NO_SPANNING_TREE = (
+    "no spanning tree: from the leader, or from those who measure, news does not reach every vehicle, "
+    "and who is not reached cannot follow"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """What `evaluate` found; prints as a table."""
+
+    env_id: str
+    policy: str
+    seed: int  # of the first flight
+    records: tuple[Record, ...]
+    decision_ms: tuple[float, float, float]  # p50, p99, max over all decisions, ms; nan if not timed
+    team_ms: tuple[float, float, float] = _NOT_TIMED  # the same for all vehicles of a team at once
+    vehicles: int = 1  # of a team
+    spanning_tree: bool | None = None  # whether news can reach every vehicle of a team; None for one vehicle
+    privileged: bool = False  # whether the policy saw the whole truth
+
+    @property
+    def title(self) -> str:
+        """Name of the policy for tables, which says if it is privileged."""
+        return f"{self.policy} (privileged)" if self.privileged else self.policy
+
+    @property
+    def flights(self) -> int:
+        """Flights, each of one vehicle or of one team."""
+        return len(by_flight(self.records))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What one has to know to read the numbers."""
+        return (NO_SPANNING_TREE,) if self.spanning_tree is False else ()
+
+    def summary(self) -> dict[str, Estimate]:
+        """Column -> mean and 95 % interval over the flights."""
+        return summarize(self.records)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain numbers for JSON; what is not a number is None."""
+        p50, p99, slowest = self.decision_ms
+        found = {
+            "env": self.env_id,
+            "policy": self.title,
+            "seed": self.seed,
+            "episodes": self.flights,
+            "summary": {name: value._asdict() for name, value in self.summary().items()},
+            **totals(self.records),
+            "crash_causes": crash_causes(self.records),
+            "iterations_max": max(record.iterations_max for record in self.records),
+            "worst_violation": dict(worst_violations(self.records)),
+            "decision_ms": {"p50": p50, "p99": p99, "max": slowest},
+            **self._of_team(),
+            "records": [record.row() for record in self.records],
+        }
+        plain: dict[str, Any] = plain_json(found)
+        return plain
+
+    def _of_team(self) -> dict[str, Any]:
+        """What only a team has."""
+        if self.spanning_tree is None:
+            return {}
+        return {
+            "vehicles": self.vehicles,
+            "privileged": self.privileged,
+            "spanning_tree": self.spanning_tree,
+            "notes": self.notes,
+            "team_decision_ms": dict(zip(("p50", "p99", "max"), self.team_ms, strict=True)),
+        }
+
+    def to_plain(self) -> dict[str, Any]:
+        """Everything in it, for storage as JSON; `from_plain` reads it."""
+        records = [record._asdict() for record in self.records]
+        found = {entry.name: getattr(self, entry.name) for entry in fields(self)} | {"records": records}
+        plain: dict[str, Any] = plain_json(found)
+        return plain
+
+    @classmethod
+    def from_plain(cls, plain: Mapping[str, Any]) -> Evaluation:
+        """What `to_plain` stored."""
+
+        def read(value: Any) -> Any:
+            return math.nan if value is None else value
+
+        records = (
+            Record(**{key: read(value) for key, value in record.items()}) for record in plain["records"]
+        )
+        times = {name: tuple(map(read, plain[name])) for name in ("decision_ms", "team_ms")}
+        return cls(**{**plain, **times, "records": tuple(records)})
+
+    def __str__(self) -> str:
+        return str(self._table())
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        return self._table().html()
+
+    def _table(self) -> Table:
+        rows = []
+        for name, value in self.summary().items():
+            found = flight_values(self.records, name)
+            if not self._tells(name, found.values()):
+                continue
+            finite = [number for number in found.values() if math.isfinite(number)]
+            spread = (min(finite), max(finite)) if math.isfinite(value.mean) else (math.nan, math.nan)
+            cells = [value.mean, value.half_width, *spread]
+            unit = _UNITS[name.removesuffix("_worst")]
+            rows.append([name, unit, *map(format_number, cells), str(value.n)])
+        counts = totals(self.records).items()
+        counted = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counts)
+        of_team = f" of {self.vehicles} vehicles" if has_team(self.records) else ""
+        title = f"{self.title} on {self.env_id}, {self.flights} flights{of_team} from seed {self.seed}"
+        notes = (f"note: {note}" for note in self.notes)
+        lines = [f"decisions: {_times(self.decision_ms)}" + (" per vehicle" if of_team else "")]
+        if of_team:
+            lines.append(f"decisions of the whole team: {_times(self.team_ms)}")
+        lines.append(f"counts: {counted}")
+        worst = worst_violations(self.records)
+        if crash_causes(self.records):
+            lines.append(f"crashes by: {said_causes(self.records)}")
+        if worst:
+            lines.append("worst violation: " + ", ".join(f"{k} {format_number(v)}" for k, v in worst.items()))
+        header = ["metric", "unit", "mean", "+- 95 %", "min", "max", "flights"]
+        return Table((title, *notes), header, rows, tuple(lines))
+
+    def _tells(self, name: str, values: Iterable[float]) -> bool:
+        """Whether a column has anything to say: a number, or that a crash left none."""
+        if not has_team(self.records):
+            return name in AVERAGED
+        lost = name in (*CUT_SHORT, *TEAM_CUT_SHORT) and not name.startswith("estimate")
+        return any(map(math.isfinite, values)) or (lost and any(record.crashed for record in self.records))
+
+
+def _times(quantiles: tuple[float, float, float]) -> str:
+    p50, p99, slowest = map(format_number, quantiles)
+    return f"p50 {p50} ms, p99 {p99} ms, max {slowest} ms"
+
+
+def fly_and_measure(
+    policy: Policy | Any,
+    env: Any,
+    episodes: int = 20,
+    seed: int = 0,
+    on_episode: Callable[[Episode], None] | None = None,
+    *,
+    mismatch: bool = False,
+) -> Evaluation:
+    """What `evaluate` does where nothing is to be written.
+
+    Only numbers are kept of each flight, so that memory does not grow with its length. A team gives one
+    record per vehicle and flight; means and intervals are over flights.
+
+    Args:
+        policy: Anything with `predict`, or what `make_policy` takes.
+        env: An id, a Gymnasium environment or a ParallelEnv (decisions are timed), or a vector environment.
+        episodes: Number of flights, >= 1.
+        seed: Flight i starts with the environment seed `seed + i`.
+        on_episode: Called with each flight, of a team with that of each vehicle, to save or plot it.
+        mismatch: Whether the policy may be one of another task on purpose, see `run_episodes`. Conditions
+            with `randomize` need it not: the task knows the nominal vehicle.
+
+    Raises:
+        ValueError: If the id or the policy's name is unknown, episodes < 1, or as `run_episodes` says.
+    """
+    env, size = make_env(env) if isinstance(env, str) else env, 1
+    name = policy if isinstance(policy, str) else ""
+    policy = policy if is_policy(policy) else make_policy(policy, env)
+    records, times, team_times = [], [], []
+    for episode in run_episodes(policy, env, episodes, seed, mismatch=mismatch):
+        records.append(measure(episode))
+        size = episode.team_size
+        times.append(episode.decision_times.astype(np.float32))
+        team_times.append(size * times[-1])
+        if on_episode is not None:
+            on_episode(episode)
+    task: BaseTask = env.unwrapped.task
+    return Evaluation(
+        env_id=task.env_id,
+        policy=policy_name(policy, name),
+        seed=seed,
+        records=tuple(records),
+        decision_ms=decision_quantiles(np.concatenate(times)),
+        team_ms=decision_quantiles(np.concatenate(team_times)) if size > 1 else _NOT_TIMED,
+        vehicles=size,
+        spanning_tree=task.spanning_tree if isinstance(task, TeamTask) else None,
+        privileged=is_privileged(policy),
+    )

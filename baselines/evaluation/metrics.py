@@ -1,0 +1,267 @@
+"""From a flight to the numbers by which policies are compared, and from flights to means with intervals.
+
+The columns stand side by side and are never merged into one. RMS and effort are the dissertation's "average
+RMS" and input effort: means over the samples k = 0..T-1 that were flown. What a crash cuts short, so that it
+would look cheap, is nan, and so are the mean and the paired difference of these columns (CUT_SHORT) as soon
+as one flight crashed: the mean over the survivors would favour a policy that crashes on the hard starts.
+
+A team gives one record per vehicle. Its vehicles are averaged within a flight before anything else.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quad_envs.constraints import TOLERANCE
+from quad_envs.parameters import POSITION, Array
+from quad_envs.tasks import TeamTask
+
+from .episode import Episode
+from .record import drop_team_columns
+from .team_metrics import TEAM_CUT_SHORT, TEAM_SUMMARY, by_flight, flight_values, has_team, measure_team
+
+_NAN = float("nan")
+
+SETTLED = 0.05  # share of the initial position error below which the vehicle has settled
+SETTLING_LEAST = 0.1  # m, initial position error from which settling means anything
+SATURATED = 1e-6  # N, distance from a face of the rotor box that counts as on it
+
+
+class Record(NamedTuple):
+    """One flight in numbers."""
+
+    seed: int  # of the environment
+    steps: int  # control periods flown
+    score: float  # -, sum of (1 - v) / (1 + l) over the flight / length of the FULL time limit, 0 to 1
+    cost: float  # -, sum of the stage costs l(x_{k+1}, u_k); nan after a crash
+    position_rms: float  # m, sqrt(mean |p_k - p_ref,k|^2); nan after a crash
+    steady_rms: float  # m, the same over the second half of the time limit; nan after a crash
+    effort: float  # N^2, mean |u_k - u_T|^2 of the commands
+    settling_time: float  # s, last sample above 5 % of the initial position error; nan if there is none
+    violation_share: float  # -, share of steps in which a limit was exceeded
+    crashed: bool
+    saturation_share: float  # -, share of rotor commands at a face of the box
+    decision_p50_ms: float  # ms of wall time in predict, median; nan if not timed
+    decision_p99_ms: float  # ms
+    decision_max_ms: float  # ms
+    relaxed: int  # decisions whose hard rows were made soft
+    previous_plan: int  # decisions that took the shifted previous plan
+    clipped_sdre: int  # decisions that took the clipped unconstrained input
+    hover: int  # decisions that took hover thrust
+    iterations_max: int  # most solver iterations of a decision
+    worst_violation: dict[str, float]  # constraint name -> largest excess over its limit, SI
+    agent: str = ""
+    crash_cause: str = ""  # one of `task.crash_causes`
+    left_model: int = 0  # decisions whose state or plan left where the policy's model holds
+    # Of a team's vehicle; nan where the task or the policy does not have them.
+    formation_rms: float = _NAN  # m, distance to the own slot
+    formation_final: float = _NAN  # m, its mean over the last second
+    formation_settling: float = _NAN  # s, last sample above 0.1 m; nan if it stays above to the end
+    min_separation: float = _NAN  # m, smallest distance to another vehicle
+    z_error_max: float = _NAN  # m, largest height error to the slot
+    z_error_rms: float = _NAN  # m
+    messages: float = _NAN  # heard per step
+    estimate_rmse: float = _NAN  # m, estimated position of the target, whole flight
+    estimate_sigma: float = _NAN  # m, sqrt(mean trace P) of that position, as the policy believes
+    anees: float = _NAN  # -, mean of e' P^-1 e of that position / 3; 1 for an honest filter
+    nis_ratio: float = _NAN  # -, mean of NIS / rows over the updates; 1 for an honest filter
+    trilateration_share: float = _NAN  # -, updates as a trilaterated position; nan if none was
+
+    def row(self) -> dict[str, Any]:
+        """Flat form for tables: `worst_violation` becomes one column per constraint."""
+        flat = self._asdict()
+        worst = flat.pop("worst_violation")
+        if not self.agent:
+            flat = drop_team_columns(flat)
+        return flat | {f"worst_{name}": value for name, value in worst.items()}
+
+
+# Columns that `summarize` averages; the rest are counted or taken at their worst.
+AVERAGED = (
+    "score",
+    "cost",
+    "position_rms",
+    "steady_rms",
+    "effort",
+    "settling_time",
+    "violation_share",
+    "saturation_share",
+)
+# Columns that are nan after a crash, and therefore not averaged over what is left.
+CUT_SHORT = ("cost", "position_rms", "steady_rms", "settling_time")
+COUNTED = ("crashed", "relaxed", "previous_plan", "clipped_sdre", "hover", "left_model")
+
+
+def measure(episode: Episode) -> Record:
+    """Reduce a flight to its numbers."""
+    task, steps = episode.task, len(episode.rewards)
+    v = np.minimum(1.0, episode.costs)
+    bounded = (1.0 - v) / (1.0 + episode.stage_costs)
+    if episode.crashed:
+        bounded[-1] = 0.0  # as in the reward, which a wrapper or reward="quadratic" may have replaced
+    error = _position_error(episode)
+    du = episode.commands - task.hover_force
+    excess = np.maximum(episode.constraint_values, 0.0).max(axis=0, initial=0.0)
+    excess[excess <= TOLERANCE] = 0.0  # as the environments count violations
+    p50, p99, slowest = decision_quantiles(episode.decision_times)
+    return Record(
+        seed=episode.seed,
+        steps=steps,
+        score=float(bounded.sum()) / task.episode_steps,
+        cost=float("nan") if episode.crashed else float(episode.stage_costs.sum()),
+        position_rms=float("nan") if episode.crashed else _rms(error),
+        steady_rms=float("nan") if episode.crashed else _rms(error[task.episode_steps // 2 :]),
+        effort=float((du * du).sum(axis=1).mean()),
+        settling_time=_settling_time(error, task.dt) if not episode.crashed else float("nan"),
+        violation_share=float(episode.violations.mean()),
+        crashed=episode.crashed,
+        saturation_share=_saturation_share(episode.commands, task.force_max),
+        decision_p50_ms=p50,
+        decision_p99_ms=p99,
+        decision_max_ms=slowest,
+        relaxed=int(episode.fallbacks[1]),
+        previous_plan=int(episode.fallbacks[2]),
+        clipped_sdre=int(episode.fallbacks[3]),
+        hover=int(episode.fallbacks[4]),
+        iterations_max=episode.worst_iterations,
+        worst_violation=dict(zip(task.constraint_names, excess.tolist(), strict=True)),
+        agent=episode.agent,
+        crash_cause=episode.crash_cause,
+        left_model=episode.left_model,
+        **measure_team(episode),
+    )
+
+
+def _position_error(episode: Episode) -> Array:
+    """|p_k - p_ref,k| for k = 0..T-1, (T,); nan where plants are not shown or are not commanded."""
+    steps = len(episode.rewards)
+    if isinstance(episode.task, TeamTask) and episode.task.mission == "estimation":
+        return np.full(steps, np.nan)
+    if episode.states.shape[1] == 0 or len(episode.references) < steps:
+        return np.full(steps, np.nan)
+    error = episode.states[:steps, POSITION] - episode.references[:steps, POSITION]
+    return np.asarray(np.linalg.norm(error, axis=1))
+
+
+def _rms(error: Array) -> float:
+    return float(np.sqrt(np.mean(error * error))) if error.size else float("nan")
+
+
+def _settling_time(error: Array, dt: float) -> float:
+    """Last sample above 5 % of the initial error, s; nan if it begins small or stays above to the end."""
+    if not error[0] >= SETTLING_LEAST:
+        return float("nan")
+    last = int(np.flatnonzero(error > SETTLED * error[0])[-1])
+    return last * dt if last < len(error) - 1 else float("nan")
+
+
+def _saturation_share(commands: Array, force_max: Array) -> float:
+    if np.isnan(commands).any():  # actions that command no rotors
+        return float("nan")
+    return float(((commands <= SATURATED) | (commands >= force_max - SATURATED)).mean())
+
+
+def decision_quantiles(seconds: Array) -> tuple[float, float, float]:
+    """Median, 99th percentile and maximum of decision times, ms; nan if none was measured."""
+    timed = seconds[np.isfinite(seconds)]
+    if timed.size == 0:
+        return float("nan"), float("nan"), float("nan")
+    p50, p99 = np.percentile(timed, [50.0, 99.0])
+    return 1e3 * float(p50), 1e3 * float(p99), 1e3 * float(timed.max())
+
+
+class Estimate(NamedTuple):
+    """A mean with its 95 % interval mean +- half_width (Student's t); nan where there are too few values."""
+
+    mean: float
+    half_width: float
+    n: int  # values behind it; those that are nan are left out
+
+
+_NO_ESTIMATE = Estimate(float("nan"), float("nan"), 0)
+
+
+def estimate(values: Iterable[float]) -> Estimate:
+    """Mean and 95 % interval over flights."""
+    from scipy.special import stdtrit
+
+    x = np.array([value for value in values if np.isfinite(value)], dtype=np.float64)
+    if x.size == 0:
+        return _NO_ESTIMATE
+    if x.size == 1:
+        return Estimate(float(x[0]), float("nan"), 1)
+    t = float(stdtrit(x.size - 1, 0.975))
+    return Estimate(float(x.mean()), t * float(x.std(ddof=1)) / float(np.sqrt(x.size)), x.size)
+
+
+def paired_difference(ours: Sequence[Record], theirs: Sequence[Record], column: str) -> Estimate:
+    """Mean of ours - theirs over flights from the same start, of teams over whole teams.
+
+    The spread between starts is far larger than that between policies on one start. A column of CUT_SHORT has
+    no difference, nan, where one of the paired flights crashed.
+
+    Args:
+        ours: Records of one policy.
+        theirs: Records of another in the same environment.
+        column: One of AVERAGED, or of TEAM_SUMMARY.
+
+    Raises:
+        ValueError: If the column is not averaged, or no seed is in both.
+    """
+    if column not in (*AVERAGED, *TEAM_SUMMARY):
+        raise ValueError(f"column must be one of {', '.join((*AVERAGED, *TEAM_SUMMARY))}, got {column!r}")
+    one, other = flight_values(ours, column), flight_values(theirs, column)
+    seeds = dict.fromkeys(seed for seed in one if seed in other)
+    if not seeds:
+        raise ValueError("paired_difference needs flights with the same seeds, and these have none in common")
+    crashed = any(record.crashed for record in (*ours, *theirs) if record.seed in seeds)
+    if column in (*CUT_SHORT, *TEAM_CUT_SHORT) and crashed:
+        return _NO_ESTIMATE
+    return estimate(one[seed] - other[seed] for seed in seeds)
+
+
+def summarize(records: Sequence[Record]) -> dict[str, Estimate]:
+    """Column -> estimate over flights, for every averaged column and for a team's, if it is one.
+
+    Those of CUT_SHORT are nan if a flight crashed.
+    """
+    crashed = any(record.crashed for record in records)
+    names = (*AVERAGED, *TEAM_SUMMARY) if has_team(records) else AVERAGED
+    return {
+        name: _NO_ESTIMATE
+        if crashed and name in (*CUT_SHORT, *TEAM_CUT_SHORT)
+        else estimate(flight_values(records, name).values())
+        for name in names
+    }
+
+
+def totals(records: Sequence[Record]) -> dict[str, int]:
+    """Column -> sum, for every counted column; of crashes the flights, however many vehicles crash."""
+    counts = {name: int(sum(getattr(record, name) for record in records)) for name in COUNTED}
+    crashed = sum(any(record.crashed for record in team) for team in by_flight(records).values())
+    return counts | {"crashed": crashed}
+
+
+def crash_causes(records: Sequence[Record]) -> dict[str, int]:
+    """Cause -> flights in which a vehicle crashed by it, the most frequent first."""
+    found = Counter(
+        cause
+        for team in by_flight(records).values()
+        for cause in {record.crash_cause for record in team} - {""}
+    )
+    return dict(found.most_common())
+
+
+def said_causes(records: Sequence[Record]) -> str:
+    """Those causes as words, "tilt 2, lost 1"."""
+    return ", ".join(f"{cause} {n}" for cause, n in crash_causes(records).items())
+
+
+def worst_violations(records: Sequence[Record]) -> Mapping[str, float]:
+    """Constraint name -> largest excess over all flights, SI."""
+    names = records[0].worst_violation if records else {}
+    return {name: max(record.worst_violation[name] for record in records) for name in names}

@@ -1,0 +1,188 @@
+"""Checkpoints: a folder with `network.safetensors` and `policy.json`. Loading one runs no code.
+
+Weights travel as safetensors, never as pickles, because a pickle can run anything when it is opened.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import stat
+from collections.abc import Mapping
+from contextlib import suppress
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from quad_envs.names import shown
+
+from ..errors import CheckpointError, ResultsError
+from ..files import write_atomic
+from .network import Features, Network
+
+FORMAT = 2  # rises when an older suite could not read a checkpoint; 2: relu layers, cut features
+_OLDEST = 1  # that this version reads, and writes where that says all
+WEIGHTS, DESCRIPTION = "network.safetensors", "policy.json"
+_LARGEST = 50_000_000  # bytes; the networks here are a thousandth of it
+_PACKAGES = ("quad-envs", "numpy", "gymnasium", "torch", "stable-baselines3")
+
+
+def versions() -> dict[str, str]:
+    """Of Python and the packages that made a checkpoint."""
+    found = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def save_checkpoint(folder: str | Path, network: Network, about: Mapping[str, Any]) -> None:
+    """Write a checkpoint; one that is there stays whole until the new one is complete.
+
+    Args:
+        folder: Made if need be.
+        network: The network.
+        about: What else to say: env_id, algorithm, kind, seed, command, score, ...
+
+    Raises:
+        CheckpointError: If the folder cannot be written.
+    """
+    from safetensors.numpy import save
+
+    path = Path(folder)
+    tensors = {}
+    for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
+        tensors[f"{k}.weight"], tensors[f"{k}.bias"] = np.ascontiguousarray(W), np.ascontiguousarray(b)
+    plain = network.activation == "tanh" and network.features.clip is None
+    described = {
+        "format": _OLDEST if plain else FORMAT,
+        "layers": [list(W.shape) for W in network.weights],
+        "squash": network.squash,
+        "commands": network.commands,
+        "features": {
+            "names": list(network.features.names),
+            "mean": list(network.features.mean),
+            "scale": list(network.features.scale),
+            **({} if plain else {"clip": network.features.clip}),
+        },
+        **({} if plain else {"activation": network.activation}),
+        "versions": versions(),
+        **about,
+    }
+    # The description carries the digest of its weights: a pair that does not belong together is refused.
+    data = save(tensors, metadata={"format": str(described["format"])})
+    described["digest"] = _digest(data)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        write_atomic(path / f"{WEIGHTS}.new", data)
+        write_atomic(path / f"{DESCRIPTION}.new", (json.dumps(described, indent=1) + "\n").encode())
+        os.replace(path / f"{WEIGHTS}.new", path / WEIGHTS)
+        os.replace(path / f"{DESCRIPTION}.new", path / DESCRIPTION)
+    except (OSError, ResultsError) as error:
+        for name in (WEIGHTS, DESCRIPTION):
+            with suppress(OSError):
+                (path / f"{name}.new").unlink(missing_ok=True)
+        raise CheckpointError(
+            f"cannot write the checkpoint {str(path)!r} ({error}); the one before it, if any, is as it was"
+        ) from error
+
+
+def load_checkpoint(folder: str | Path) -> tuple[Network, dict[str, Any]]:
+    """Read a checkpoint.
+
+    Args:
+        folder: That holds network.safetensors and policy.json.
+
+    Returns:
+        The network, and the whole of policy.json.
+
+    Raises:
+        CheckpointError: If it is not a checkpoint, of another format, truncated, or inconsistent.
+    """
+    path = Path(folder)
+    where = f"checkpoint {str(path)!r}"
+    described = _read_description(path, where)
+    data = _read(path / WEIGHTS, where)
+    tensors = _read_tensors(data, where)
+    if described.get("digest") != _digest(data):
+        raise CheckpointError(
+            f"{where}: {DESCRIPTION} describes other weights than {WEIGHTS} holds; train again"
+        )
+    try:
+        features = described["features"]
+        network = Network(
+            features=Features(
+                tuple(map(str, features["names"])),
+                tuple(map(float, features["mean"])),
+                tuple(map(float, features["scale"])),
+                None if features.get("clip") is None else float(features["clip"]),
+            ),
+            weights=tuple(tensors[f"{k}.weight"] for k in range(len(tensors) // 2)),
+            biases=tuple(tensors[f"{k}.bias"] for k in range(len(tensors) // 2)),
+            squash=described["squash"],
+            commands=described["commands"],
+            activation=described.get("activation", "tanh"),
+        )
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise CheckpointError(f"{where} is not a valid network: {error}") from error
+    return network, described
+
+
+def _open_at_once(path: str, flags: int) -> int:
+    """A pipe is opened, too, without waiting for its writer."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
+def _read(file: Path, where: str) -> bytes:
+    """The bytes of a regular file; pipes and devices, which may have no end, are not read."""
+    try:
+        with open(file, "rb", opener=_open_at_once) as stream:
+            if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+                raise CheckpointError(f"{where}: {file.name} is no regular file")
+            data = stream.read(_LARGEST + 1)
+    except OSError as error:
+        raise CheckpointError(
+            f"{where}: cannot read {file.name}: {error.strerror or error}; a checkpoint is a folder with "
+            f"{WEIGHTS} and {DESCRIPTION}"
+        ) from error
+    if len(data) > _LARGEST:
+        raise CheckpointError(
+            f"{where}: {file.name} has more than {_LARGEST} bytes; no checkpoint of ours has"
+        )
+    return data
+
+
+def _read_description(path: Path, where: str) -> dict[str, Any]:
+    try:
+        described = json.loads(_read(path / DESCRIPTION, where))
+    except (ValueError, RecursionError) as error:
+        raise CheckpointError(f"{where}: {DESCRIPTION} is not valid JSON: {error}") from error
+    if not isinstance(described, dict) or described.get("format") not in range(_OLDEST, FORMAT + 1):
+        found = described.get("format") if isinstance(described, dict) else described
+        raise CheckpointError(
+            f"{where} has format {shown(found)}, this version reads {_OLDEST} to {FORMAT}: train again, or "
+            "use the version of quad-envs that wrote it"
+        )
+    return described
+
+
+def _read_tensors(data: bytes, where: str) -> dict[str, Any]:
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    try:
+        return dict(load(data))
+    except (SafetensorError, ValueError, KeyError) as error:
+        raise CheckpointError(
+            f"{where}: {WEIGHTS} is not a safetensors file, or truncated ({error}); pickles are never opened"
+        ) from error
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()

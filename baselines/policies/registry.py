@@ -1,0 +1,303 @@
+"""The names that `make_policy` knows, and what it makes of them."""
+
+from __future__ import annotations
+
+import inspect
+import os
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+import numpy as np
+
+from quad_envs.kinds import holds_booleans, is_limit
+from quad_envs.names import shown, unknown_name
+
+from .outside import build, installed_policies, is_outside, names_factory, outside_options
+from .protocol import Policy
+from .trained import load_policy, names_trained, shipped_policies
+
+if TYPE_CHECKING:  # not at run time: tasks load numba, and `quad-envs list` has to be quick
+    from quad_envs.tasks import BaseTask, Task, TeamTask
+
+
+class PolicyEntry(NamedTuple):
+    """A row of the registry."""
+
+    module: str
+    factory: str  # name in the module: called with the task and the options
+    description: str
+    missions: tuple[str, ...] = ("tracking",)  # that it serves, see `mission_of`
+    decision_ms: float = 0.05  # about, of a vehicle: sweeps fly the quick ones first, and estimate their time
+    privileged: bool = False  # it sees `env.state()`: a yardstick, listed apart
+
+
+_FORMATION, _TARGET, _ESTIMATION = "formation", "target-tracking", "estimation"
+TEAM_MISSIONS = (_FORMATION, _TARGET, _ESTIMATION)
+
+# Names that `make_policy` knows for tracking tasks.
+TRACKING_POLICIES: dict[str, PolicyEntry] = {
+    "lmpc": PolicyEntry(
+        "controllers", "LinearMPC", "linear MPC on the hover model (chapter 3)", decision_ms=0.06
+    ),
+    "sdc-nmpc": PolicyEntry(
+        "controllers", "SdcNmpc", "MPC on the state-dependent model (chapter 4)", decision_ms=0.13
+    ),
+    "nmpc": PolicyEntry(
+        "controllers", "ExactNmpc", "MPC on the exact model: real-time iteration, or SQP", decision_ms=0.2
+    ),
+    "sdre": PolicyEntry(
+        "controllers", "Sdre", "state-dependent Riccati feedback, without preview", decision_ms=0.08
+    ),
+    "lqr": PolicyEntry(
+        "controllers", "Lqr", "constant feedback of the hover model, without preview", decision_ms=0.01
+    ),
+    "feedback-linearization": PolicyEntry(
+        "controllers",
+        "FeedbackLinearization",
+        "feedback linearization with an attitude loop",
+        decision_ms=0.01,
+    ),
+    "hover": PolicyEntry(
+        "baselines.policies.tracking", "Hover", "hover thrust, whatever happens", decision_ms=0.0
+    ),
+    "random": PolicyEntry("baselines.policies.tracking", "Random", "uniform random actions", decision_ms=0.0),
+}
+
+# And for teams; "hover" and "random" serve both.
+TEAM_POLICIES: dict[str, PolicyEntry] = {
+    "consensus-mpc": PolicyEntry(
+        "baselines.policies.cooperative",
+        "ConsensusMpc",
+        "consensus, collision avoidance and MPC of each vehicle (chapter 5)",
+        (_FORMATION,),
+    ),
+    "cooperative-mpc": PolicyEntry(
+        "baselines.policies.cooperative",
+        "make_cooperative_mpc",
+        "the same beside a target that it estimates (chapter 7)",
+        (_TARGET, _ESTIMATION),
+    ),
+    "ekf": PolicyEntry(
+        "baselines.policies.estimation",
+        "EkfPolicy",
+        "extended Kalman filter on the measurements held (chapter 6)",
+        (_ESTIMATION,),
+    ),
+    "trilateration": PolicyEntry(
+        "baselines.policies.estimation",
+        "TrilaterationPolicy",
+        "trilateration where four ranges allow it, else the Kalman filter (chapter 6)",
+        (_ESTIMATION,),
+    ),
+    "central-mpc": PolicyEntry(
+        "baselines.policies.central",
+        "CentralMpcPolicy",
+        "one MPC over the whole team, from the whole truth (8.2.3)",
+        (_FORMATION, _TARGET),
+        decision_ms=0.5,
+        privileged=True,
+    ),
+    "hover": PolicyEntry(
+        "baselines.policies.team",
+        "TeamHover",
+        "hover thrust, whatever happens",
+        TEAM_MISSIONS,
+        decision_ms=0.0,
+    ),
+    "random": PolicyEntry(
+        "baselines.policies.team", "TeamRandom", "uniform random actions", TEAM_MISSIONS, decision_ms=0.0
+    ),
+}
+
+
+def mission_of(task: BaseTask) -> str:
+    """What policies of a task do: "tracking", "formation", "target-tracking" or "estimation"."""
+    return str(getattr(task, "mission", "tracking"))
+
+
+def serving(mission: str) -> dict[str, PolicyEntry]:
+    """The policies that serve a mission."""
+    table = TRACKING_POLICIES if mission == "tracking" else TEAM_POLICIES
+    return {name: entry for name, entry in table.items() if mission in entry.missions}
+
+
+def policy_entry(name: str, mission: str | None = None) -> PolicyEntry:
+    """The row of a policy in the registry.
+
+    Args:
+        name: Of the policy.
+        mission: That it has to serve; None: any.
+
+    Raises:
+        ValueError: If there is no such policy, or it serves other missions; it names those that serve.
+    """
+    known = TEAM_POLICIES | TRACKING_POLICIES
+    if name not in known:
+        able = known if mission is None else serving(mission)
+        names = [*able, *shipped_policies(), *installed_policies()]
+        raise ValueError(
+            unknown_name("policy", name, names)
+            + ", the folder of a trained one, or module:factory of your own"
+        )
+    if mission is None:
+        return known[name]
+    able = serving(mission)
+    if name not in able:
+        serves = " and ".join(known[name].missions)
+        raise ValueError(
+            f"policy {name!r} is for {serves} tasks, not for {mission}; those that are: {', '.join(able)}"
+        )
+    return able[name]
+
+
+def is_trained(name: str | os.PathLike[str]) -> bool:
+    """Whether a name is that of a trained policy, and not of a controller."""
+    return not (name in TEAM_POLICIES | TRACKING_POLICIES or names_factory(name)) and names_trained(name)
+
+
+def from_outside(source: Any) -> bool:
+    """Whether a policy, or its name, is none of this suite, whose own names go before others."""
+    if isinstance(source, str) and (source in TEAM_POLICIES | TRACKING_POLICIES or is_trained(source)):
+        return False
+    return is_outside(source)
+
+
+def _factory(entry: PolicyEntry) -> Callable[..., Any]:
+    found: Callable[..., Any] = getattr(import_module(entry.module), entry.factory)
+    return found
+
+
+def policy_name(policy: Any, otherwise: str = "") -> str:
+    """Name of a policy for tables: its own, or else the other one, or else its class."""
+    return str(getattr(policy, "name", otherwise or type(policy).__name__))
+
+
+def policy_options(name: str) -> dict[str, Any]:
+    """Options of a policy and their defaults.
+
+    Raises:
+        ValueError: If the name is unknown.
+        PolicyError: If it is one of the user's that cannot be imported.
+    """
+    if from_outside(name):
+        return outside_options(name)
+    return {parameter.name: parameter.default for parameter in _parameters(name)}
+
+
+def _parameters(name: str) -> list[inspect.Parameter]:
+    """Of a policy's factory, behind the task."""
+    return list(inspect.signature(_factory(policy_entry(name))).parameters.values())[1:]
+
+
+def _check_kind(name: str, parameter: inspect.Parameter, value: Any) -> None:
+    """Refuse a word for a number and the like; whether the number is allowed, the controller knows."""
+    option, default, hint = parameter.name, parameter.default, str(parameter.annotation)
+    if "ArrayLike" in hint:
+        kind, fits = "numbers", not isinstance(value, str) and not holds_booleans(value)
+    elif isinstance(default, bool):
+        kind, fits = "True or False", isinstance(value, bool | np.bool_)
+    elif isinstance(default, int | float):
+        kind, fits = "a number", is_limit(value)
+    elif isinstance(default, str) and default != "auto":  # "auto" stands for a number, too
+        kind, fits = "a name", isinstance(value, str)
+    else:
+        kind, fits = "no boolean", "Any" in hint or "bool" in hint or not isinstance(value, bool | np.bool_)
+    if not fits:
+        raise ValueError(
+            f"{option} of policy {name!r} must be {kind}, got {shown(value)} (default {default!r})"
+        )
+
+
+def make_policy(name: str | os.PathLike[str] | Any, env: Any, **options: Any) -> Policy:
+    """A policy for a task.
+
+    Args:
+        name: One of TRACKING_POLICIES, or for a team one of TEAM_POLICIES; or a trained policy: the folder
+            of its training, or the name of a shipped one; or one of the user's: `module:factory`, the name of
+            an entry point, a factory, or a policy. A factory is called with the task, or with the environment
+            if its first parameter is called `env`.
+        env: An environment (wrapped or not), a vector environment, an id, or a Task. Only its Task is used.
+        options: Of the policy, see `policy_options`; MPCs take `horizon`, `solver` and what their chapter
+            offers. A horizon that is not given is 25, or the preview of the task where that is shorter.
+            Feedback linearization uses the acceleration of the reference where there is a preview.
+
+    Raises:
+        ValueError: If the name, an option or its value is not allowed, the policy is for other tasks, or the
+            horizon exceeds the preview.
+        CheckpointError: If a trained policy cannot be read, or is for other tasks.
+        PolicyError: If one of the user's cannot be made; the message names the line of the user's file.
+    """
+    from .environments import environment_of, task_of
+
+    if from_outside(name):
+        made: Policy = build(name, lambda: task_of(env), lambda: environment_of(env), options)
+        return made
+    if is_trained(name):
+        if options:
+            raise ValueError(f"a trained policy has no options, got {', '.join(options)}")
+        return load_policy(name, env)
+    name = str(name)
+    known = {parameter.name: parameter for parameter in _parameters(name)}
+    for option, value in options.items():
+        if option not in known:
+            raise ValueError(unknown_name(f"option of policy {name!r}:", option, known))
+        _check_kind(name, known[option], value)
+    defaults = policy_options(name)
+    task: BaseTask = task_of(env)
+    factory = _factory(policy_entry(name, mission_of(task)))
+    if mission_of(task) in TEAM_MISSIONS:
+        return _make_team_policy(name, factory, cast("TeamTask", task), defaults, options)
+    return _make_tracking_policy(name, factory, cast("Task", task), defaults, options)
+
+
+def _built(name: str, factory: Callable[..., Any], task: BaseTask, options: Mapping[str, Any]) -> Any:
+    try:
+        return factory(task, **options)
+    except TypeError as error:
+        raise ValueError(f"policy {name!r} refused its options {dict(options)}: {error}") from error
+
+
+def _make_tracking_policy(
+    name: str,
+    factory: Callable[..., Any],
+    task: Task,
+    defaults: Mapping[str, Any],
+    options: dict[str, Any],
+) -> Policy:
+    """A controller behind the observations of one vehicle."""
+    from .tracking import ControllerPolicy
+
+    preview = task.layout.preview
+    if "horizon" in defaults:
+        options.setdefault("horizon", min(defaults["horizon"], preview))
+    if "acceleration_feed_forward" in defaults:
+        options.setdefault("acceleration_feed_forward", defaults["acceleration_feed_forward"] and preview > 0)
+    controller = _built(name, factory, task, options)
+    if controller.horizon > preview:
+        remedy = f"horizon <= {preview}" if "horizon" in defaults else "acceleration_feed_forward=False"
+        raise ValueError(
+            f"policy {name!r} looks {controller.horizon} steps ahead, the observation {preview}: "
+            f"choose {remedy}, or gym.make({task.env_id!r}, preview={controller.horizon})"
+        )
+    return ControllerPolicy(controller, task, name)
+
+
+def _make_team_policy(
+    name: str,
+    factory: Callable[..., Any],
+    task: TeamTask,
+    defaults: Mapping[str, Any],
+    options: dict[str, Any],
+) -> Policy:
+    """A policy that reads the observations of agents; in a formation its leader needs the preview."""
+    preview = task.layout.preview
+    if "horizon" in defaults and task.mission == _FORMATION:
+        horizon = options.setdefault("horizon", max(1, min(defaults["horizon"], preview)))
+        if horizon > preview:
+            raise ValueError(
+                f"policy {name!r} looks {horizon} steps ahead, the leader sees {preview}: choose horizon <= "
+                f"{preview}, or make {task.env_id!r} with preview={horizon}"
+            )
+    policy: Policy = _built(name, factory, task, options)
+    return policy

@@ -1,0 +1,125 @@
+"""What the policies of teams share, and the two that look at nothing."""
+
+from __future__ import annotations
+
+import zlib
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quad_envs.checks import require_whole
+from quad_envs.tasks import TeamTask
+
+from .protocol import N_FALLBACKS, Actions, PolicyState
+from .rows import as_rows, as_starts, not_finite, state_of
+
+Flags = NDArray[np.bool_]
+
+
+class TeamPolicy(ABC):
+    """A policy whose rows are the observations of agents, each decided alone.
+
+    Args:
+        task: What is known of the flight; nothing else is, but the rows.
+        name: For tables and messages.
+        memory_size: Numbers that an agent carries from step to step.
+    """
+
+    privileged = False
+
+    def __init__(self, task: TeamTask, name: str, memory_size: int) -> None:
+        self.task, self.name, self.memory_size = task, name, memory_size
+        self._size = task.layout.size
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.name!r}, {self.task.env_id!r})"
+
+    def predict(
+        self,
+        observation: NDArray[Any],
+        state: PolicyState | None = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Actions, PolicyState]:
+        """Choose actions; see `Policy`.
+
+        Raises:
+            ValueError: If a shape is wrong or an observation is not finite; it names the part.
+        """
+        obs, one = as_rows(observation, self._size)
+        start = as_starts(episode_start, len(obs))
+        actions, kept = self._decide(obs, state_of(state, len(obs), self.memory_size), start)
+        return actions[0] if one else actions, kept
+
+    @abstractmethod
+    def _decide(self, obs: Actions, state: PolicyState, start: Flags) -> tuple[Actions, PolicyState]:
+        """Actions (n, action_size) and the state of n rows; `start` flags those that begin an episode."""
+
+
+def require_finite(obs: Actions, task: TeamTask) -> None:
+    """Check observations.
+
+    Raises:
+        ValueError: If one is not finite; it names the part.
+    """
+    if not np.isfinite(obs).all():
+        raise not_finite(obs, int(np.argmin(np.isfinite(obs))), task.layout.slices)
+
+
+def plain_state(state: PolicyState, start: Flags, memory: NDArray[np.float64]) -> PolicyState:
+    """The state after decisions that nothing can keep from succeeding."""
+    n = len(start)
+    fallbacks: NDArray[np.int64] = np.where(start[:, None], 0, state.fallbacks)
+    fallbacks[:, 0] += 1
+    assert fallbacks.shape == (n, N_FALLBACKS)
+    count = np.zeros(n, dtype=np.int64)
+    return PolicyState(memory, fallbacks, count, count)
+
+
+class TeamHover(TeamPolicy):
+    """Hover thrust, whatever happens: the least that a policy must beat.
+
+    On rails it estimates the target at the vehicle, at rest.
+
+    Args:
+        task: What is known of the flight.
+    """
+
+    def __init__(self, task: TeamTask) -> None:
+        super().__init__(task, "hover", 0)
+
+    def _decide(self, obs: Actions, state: PolicyState, start: Flags) -> tuple[Actions, PolicyState]:
+        require_finite(obs, self.task)
+        actions = np.zeros((len(obs), self.task.action_size), dtype=np.float32)
+        return actions, plain_state(state, start, state.memory)
+
+
+class TeamRandom(TeamPolicy):
+    """Uniform random actions, a pure function of seed, first observation of the agent's episode and step.
+
+    Args:
+        task: What is known of the flight.
+        seed: Of all draws, >= 0.
+
+    Raises:
+        ValueError: If the seed is not a whole number >= 0.
+    """
+
+    def __init__(self, task: TeamTask, seed: int = 0) -> None:
+        require_whole("seed", seed, 0)
+        super().__init__(task, "random", 2)  # stream of the episode, step
+        self._seed = int(seed)
+
+    def _decide(self, obs: Actions, state: PolicyState, start: Flags) -> tuple[Actions, PolicyState]:
+        require_finite(obs, self.task)
+        memory = np.where(start[:, None], 0.0, state.memory)
+        actions = np.empty((len(obs), self.task.action_size), dtype=np.float32)
+        for j, (stream, step) in enumerate(memory.tolist()):
+            if step == 0.0:
+                stream = zlib.crc32(obs[j].tobytes())
+            bits = np.random.Philox(key=[self._seed, int(stream)], counter=[int(step), 0, 0, 0])
+            actions[j] = np.random.Generator(bits).uniform(-1.0, 1.0, actions.shape[1])
+            memory[j] = stream, step + 1.0
+        return actions, plain_state(state, start, memory)

@@ -1,0 +1,127 @@
+"""Trained networks as policies: the folder of a training run, or a shipped one by its name."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from quad_envs.names import shown, unknown_name
+
+from ..errors import CheckpointError
+
+if TYPE_CHECKING:
+    from .network import NetworkPolicy
+
+SHIPPED = Path(__file__).parent / "policies"  # one checkpoint per folder, as "apg-helix"
+_DESCRIPTION = "policy.json"
+
+
+def shipped_policies() -> dict[str, str]:
+    """Name -> what it is, of the trained policies that come with the suite; loads none of them."""
+    return {path.parent.name: _describe(path) for path in sorted(SHIPPED.glob(f"*/{_DESCRIPTION}"))}
+
+
+def _describe(path: Path) -> str:
+    said = json.loads(path.read_text(encoding="utf-8"))
+    return f"{said['algorithm']} ({said['kind']}) on {said['env_id']}, score {said['score']:.3f}"
+
+
+@cache
+def _shipped_for() -> dict[tuple[str, str], str]:
+    """(algorithm, environment id) -> name."""
+    files = SHIPPED.glob(f"*/{_DESCRIPTION}")
+    said = {path.parent.name: json.loads(path.read_text("utf-8")) for path in files}
+    return {(entry["algorithm"], entry["env_id"]): name for name, entry in sorted(said.items())}
+
+
+def shipped_name(algorithm: str, env_id: str) -> str:
+    """Name of the shipped policy of an algorithm for a task.
+
+    Raises:
+        ValueError: If none is shipped.
+    """
+    known, env_id = _shipped_for(), env_id.removeprefix("quad_envs:")
+    if (algorithm, env_id) not in known:
+        tasks = [task for name, task in known if name == algorithm]
+        raise ValueError(
+            f"no policy of {algorithm!r} is shipped for {env_id}; there are some for: "
+            f"{', '.join(tasks) if tasks else 'no task'}"
+        )
+    return known[algorithm, env_id]
+
+
+def names_trained(name: str | os.PathLike[str]) -> bool:
+    """Whether a name can only be a trained policy: a path, something on disk, or a shipped name."""
+    text = os.fspath(name)
+    return (
+        isinstance(name, os.PathLike)
+        or os.sep in text
+        or "/" in text
+        or _is_shipped(text)
+        or os.path.exists(text)  # which a name that is too long does not
+    )
+
+
+def _is_shipped(name: str) -> bool:
+    return os.path.isfile(SHIPPED / name / _DESCRIPTION)
+
+
+def load_policy(source: str | os.PathLike[str], env: Any) -> NetworkPolicy:
+    """A trained network as a policy; no code of the checkpoint runs, and no torch is needed.
+
+    Args:
+        source: The folder of a training run or checkpoint, or a name of `shipped_policies`.
+        env: As for `make_policy`: where it is to fly.
+
+    Raises:
+        CheckpointError: If it is no checkpoint of this version, or was trained on another kind of task.
+    """
+    from .checkpoints import load_checkpoint
+    from .environments import task_of
+    from .network import NetworkPolicy
+    from .registry import mission_of
+
+    folder = checkpoint_folder(source)
+    network, said = load_checkpoint(folder)
+    task = task_of(env)
+    where, mission = f"checkpoint {str(folder)!r}", said.get("mission")
+    if mission is not None and mission != mission_of(task):
+        raise CheckpointError(
+            f"{where} was trained on {shown(said.get('env_id'))}, a task of the kind {shown(mission)}; "
+            f"{task.env_id} is one of {mission_of(task)}: train one for it with quad-envs train {task.env_id}"
+        )
+    name = os.fspath(source) if folder.parent == SHIPPED else folder.name or str(folder)
+    try:
+        return NetworkPolicy(network, task, name, str(said.get("kind", "")))
+    except ValueError as error:
+        raise CheckpointError(f"{where} does not fit {task.env_id}: {error}") from error
+
+
+def checkpoint_folder(source: str | os.PathLike[str]) -> Path:
+    """Where a checkpoint is.
+
+    Args:
+        source: Its folder, or a name of `shipped_policies`.
+
+    Raises:
+        CheckpointError: If there is none.
+    """
+    text = os.fspath(source)
+    if not isinstance(source, os.PathLike) and _is_shipped(text):
+        return SHIPPED / text
+    path = Path(text)
+    if os.path.isfile(path):
+        raise CheckpointError(
+            f"{text!r} is a file; a trained policy is a folder with network.safetensors and {_DESCRIPTION}. "
+            "Zips of Stable-Baselines3 and .pt files of torch are pickles, which are never opened: quad-envs "
+            f"export {shlex.quote(text)} FOLDER makes a checkpoint of a zip, baselines.export_policy of a "
+            "torch module; a policy of your own in a .py file is named module:factory, as mypolicy:make"
+        )
+    if not os.path.isdir(path):
+        shipped = unknown_name("trained policy", text, shipped_policies())
+        raise CheckpointError(f"there is no folder {shown(text, 200)}, and it is not shipped: {shipped}")
+    return path

@@ -1,0 +1,194 @@
+"""Results of a suite: the tables in which policies stand side by side."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from ..evaluation.evaluate import NO_SPANNING_TREE, Evaluation
+from ..evaluation.metrics import paired_difference, said_causes, totals, worst_violations
+from ..evaluation.table import Table, format_number
+from ..files import plain_json
+from .contenders import contender_rows, contender_tables, find_contenders
+from .suite import EnvChoice, Suite
+from .units import Unit, suite_units
+
+COMPARED = ("score", "cost", "position_rms", "effort")  # columns with paired differences
+COMPARED_TEAM = ("formation_rms", "min_separation", "estimate_rmse")  # and of a team
+_FAILED = ("relaxed", "previous_plan", "clipped_sdre", "hover")
+# Columns of the printed table: title, key of the summary row, factor. Where they end stand the limits.
+_COLUMNS = (
+    ("score", "score", 1.0),
+    ("- {base}", "score_minus_base", 1.0),
+    ("+-", "score_minus_base_ci", 1.0),
+    ("cost", "cost", 1.0),
+    ("RMS m", "position_rms", 1.0),
+    ("steady m", "steady_rms", 1.0),
+    ("effort N^2", "effort", 1.0),
+    ("violating %", "violation_share", 100.0),
+)
+_TEAM_COLUMNS = (
+    ("final m", "formation_final", 1.0),
+    ("worst m", "formation_final_worst", 1.0),
+    ("settling s", "formation_settling", 1.0),
+    ("separation m", "min_separation", 1.0),
+    ("z max m", "z_error_max", 1.0),
+    ("estimate m", "estimate_rmse", 1.0),
+    ("worst m", "estimate_rmse_worst", 1.0),
+    ("ANEES", "anees", 1.0),
+    ("NIS", "nis_ratio", 1.0),
+)
+_LAST_COLUMNS = (
+    ("saturated %", "saturation_share", 100.0),
+    ("p50 ms", "decision_p50_ms", 1.0),
+    ("p99 ms", "decision_p99_ms", 1.0),
+    ("team p50 ms", "team_p50_ms", 1.0),
+    ("team p99 ms", "team_p99_ms", 1.0),
+)
+
+
+class Failure(NamedTuple):
+    """A policy from outside that did not fly in an environment."""
+
+    env: str  # title
+    policy: str  # title
+    message: str  # names the policy and the line of its file
+
+    def __str__(self) -> str:
+        return f"{self.policy} did not fly in {self.env}: {self.message}"
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """What `run_benchmark` found; prints as one table per environment."""
+
+    suite: Suite
+    evaluations: tuple[Evaluation, ...]  # one per unit of `flown`
+    trainings: tuple[Mapping[str, Any], ...] = ()  # one per network that was trained, see `training_units`
+    failures: tuple[Failure, ...] = ()
+
+    def flown(self) -> list[Unit]:
+        """Units of the suite but those that failed."""
+        failed = {(one.env, one.policy) for one in self.failures}
+        return [unit for unit in suite_units(self.suite) if (unit.env.title, unit.policy.title) not in failed]
+
+    def get(self, env: str, policy: str) -> Evaluation:
+        """The evaluation of a policy in an environment, by their titles."""
+        for unit, evaluation in zip(self.flown(), self.evaluations, strict=True):
+            if (unit.env.title, unit.policy.title) == (env, policy):
+                return evaluation
+        why = [f": {one.message}" for one in self.failures if (one.env, one.policy) == (env, policy)]
+        raise KeyError(f"no evaluation of {policy!r} in {env!r}{''.join(why)}")
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row per environment x policy x flight, of a team one per vehicle (column agent)."""
+        return [
+            {"env": unit.env.title, "policy": unit.policy.title, **record.row()}
+            for unit, evaluation in zip(self.flown(), self.evaluations, strict=True)
+            for record in evaluation.records
+        ]
+
+    def summary(self) -> list[dict[str, Any]]:
+        """One row per environment x policy: means, half widths (_ci), paired differences (_minus_base)."""
+        return [self._summary_row(unit) for unit in self.flown()]
+
+    def base_of(self, env: str) -> str:
+        """Title of the policy from which differences are taken: the suite's, else the first flown there."""
+        flown = [unit.policy.title for unit in self.flown() if unit.env.title == env]
+        return self.suite.base if self.suite.base in flown else flown[0]
+
+    def _summary_row(self, unit: Unit) -> dict[str, Any]:
+        ours = self.get(unit.env.title, unit.policy.title)
+        base = self.get(unit.env.title, self.base_of(unit.env.title))
+        row: dict[str, Any] = {
+            "env": unit.env.title,
+            "policy": unit.policy.title,
+            "episodes": ours.flights,
+        }
+        summary = ours.summary()
+        for name, value in summary.items():
+            row[name], row[f"{name}_ci"] = value.mean, value.half_width
+        for name in (*COMPARED, *COMPARED_TEAM):
+            if name in summary:
+                difference = paired_difference(ours.records, base.records, name)
+                row[f"{name}_minus_base"], row[f"{name}_minus_base_ci"] = (
+                    difference.mean,
+                    difference.half_width,
+                )
+        row |= totals(ours.records) | {"crash_causes": said_causes(ours.records)}
+        row["iterations_max"] = max(record.iterations_max for record in ours.records)
+        row |= {f"worst_{name}": value for name, value in worst_violations(ours.records).items()}
+        row |= _timed("decision", ours.decision_ms)
+        if ours.spanning_tree is not None:
+            row |= _timed("team", ours.team_ms)
+            row |= {name: getattr(ours, name) for name in ("vehicles", "privileged", "spanning_tree")}
+        return row
+
+    def contender_rows(self) -> list[dict[str, Any]]:
+        """One row per environment x contender, where all training seeds of an algorithm are one contender."""
+        names = {policy.title: policy.contender for policy in self.suite.policies}
+        contenders = find_contenders(self.suite, self.flown(), self.evaluations, self.trainings)
+        return contender_rows(contenders, names[self.suite.base])
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain numbers for JSON."""
+        found: dict[str, Any] = {
+            "suite": self.suite.to_dict(),
+            "evaluations": [one.to_dict() for one in self.evaluations],
+            "failures": [one._asdict() for one in self.failures],
+        }
+        if self.suite.learned:
+            found |= {"contenders": plain_json(self.contender_rows()), "trainings": self.trainings}
+        return found
+
+    def __str__(self) -> str:
+        return "\n\n".join([*map(str, self._tables()), *map(str, self.failures)])
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        failures = (f"<div>{html.escape(str(one))}</div>" for one in self.failures)
+        return "".join([*(table.html() for table in self._tables()), *failures])
+
+    def _tables(self) -> list[Table]:
+        """One per environment."""
+        if self.suite.learned:
+            return contender_tables(self.contender_rows())
+        flown = dict.fromkeys(unit.env.title for unit in self.flown())
+        envs = [one for env in self.suite.envs for one in self.suite.flown(env).values()]
+        return [self._table(env) for env in envs if env.title in flown]
+
+    def _table(self, env: EnvChoice) -> Table:
+        rows = [row for row in self.summary() if row["env"] == env.title]
+        limits = [key for key in rows[0] if key.startswith("worst_")]  # differ in unit, so never merged
+        before, after, team = list(_COLUMNS), list(_LAST_COLUMNS), "vehicles" in rows[0]
+        if team:
+            before[4:6] = _TEAM_COLUMNS
+        before += [(key.replace("_", " "), key, 1.0) for key in limits]
+        if not team:
+            after = [column for column in after if column[1] in rows[0]]
+        else:  # what means nothing here is nan in every row
+            before, after = (
+                [column for column in columns if any(math.isfinite(row[column[1]]) for row in rows)]
+                for columns in (before, after)
+            )
+        titles = [
+            [title.format(base=self.base_of(env.title)) for title, *_ in part] for part in (before, after)
+        ]
+        lines = []
+        for row in rows:
+            first, last = ([format_number(f * row[key]) for _, key, f in part] for part in (before, after))
+            name = row["policy"] + (" (privileged)" if row.get("privileged") else "")
+            failed = sum(row[name] for name in _FAILED)
+            counts = str(failed), str(row["left_model"])
+            lines.append([name, *first, str(row["crashed"]), *last, *counts])
+        header = ["policy", *titles[0], "crashes", *titles[1], "fallbacks", "left model"]
+        seeds = f"seeds {self.suite.seed} to {self.suite.seed + self.suite.episodes - 1}"
+        notes = () if rows[0].get("spanning_tree", True) else (f"note: {NO_SPANNING_TREE}",)
+        return Table((f"{env.title}, {seeds}", *notes), header, lines)
+
+
+def _timed(what: str, quantiles: tuple[float, float, float]) -> dict[str, float]:
+    return dict(zip((f"{what}_p50_ms", f"{what}_p99_ms", f"{what}_max_ms"), quantiles, strict=True))

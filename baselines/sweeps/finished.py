@@ -1,0 +1,69 @@
+"""Trainings of a benchmark: finished ones are taken as they are, interrupted ones go on, others begin."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..errors import CheckpointError
+from ..training.algorithms import resumable
+from ..training.plans import Plan, make_plan, read_start
+from ..training.runs import TrainingResult, train
+from .units import TrainingUnit
+
+
+def training_plan(unit: TrainingUnit) -> Plan:
+    """What a unit is to train.
+
+    Raises:
+        ValueError: If it cannot be trained.
+        MissingPackageError: If what the algorithm needs is not installed.
+    """
+    said = unit.training
+    return make_plan(
+        unit.env.id,
+        unit.policy.name,
+        seed=said.seed,
+        seconds=said.seconds,
+        steps=said.steps,
+        env_kwargs=unit.env.kwargs,
+        hyper=said.hyper,
+    )
+
+
+def train_unit(unit: TrainingUnit) -> dict[str, Any]:
+    """Train a network, unless its folder holds it already; its cost and its learning curve, as plain values.
+
+    Raises:
+        ResultsError: If the folder holds another training.
+        TrainingError: If training diverges.
+    """
+    plan = training_plan(unit)
+    found = _finished(unit, plan)
+    if found is None:
+        go_on = (unit.folder / "last").is_dir() and resumable(plan.algorithm)
+        found = train(
+            plan.env_id,
+            plan.algorithm,
+            seed=plan.seed,
+            seconds=plan.budget.seconds,
+            steps=plan.budget.steps,
+            out=unit.folder,
+            env_kwargs=plan.env_kwargs,
+            hyper=unit.training.hyper,
+            resume=go_on,
+            fresh=(unit.folder / "config.json").exists() and not go_on,
+        )
+    return found.to_dict()
+
+
+def _finished(unit: TrainingUnit, plan: Plan) -> TrainingResult | None:
+    """The result that the folder holds; None if there is no run, or an unfinished one."""
+    if not (unit.folder / "config.json").exists():
+        return None
+    try:
+        start = read_start(plan.folder(unit.folder))
+    except CheckpointError:
+        return None  # interrupted before its first policy
+    if plan.budget.share(start.seconds, start.steps) < 1.0 or start.best is None:
+        return None
+    return TrainingResult(unit.folder, plan.env_id, plan.algorithm, plan.seed, start.best, start.curve)

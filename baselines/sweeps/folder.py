@@ -1,0 +1,164 @@
+"""What a results folder holds, read for the report: configuration, finished units, saved flights."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from baselines.errors import ResultsError
+from baselines.evaluation.evaluate import Evaluation
+from baselines.evaluation.record import Record
+from baselines.evaluation.team_metrics import by_flight
+from baselines.files import FAILURES, RESULTS_FORMAT, plain_json, read_json
+from baselines.sweeps.comparison import Results
+from baselines.sweeps.suite import EnvChoice, Suite
+from baselines.sweeps.units import Unit, suite_units
+from quad_envs.constraints import TOLERANCE
+from quad_envs.tasks import BaseTask, TeamTask
+
+
+class Finished(NamedTuple):
+    """A unit of the suite that has been flown."""
+
+    unit: Unit
+    evaluation: Evaluation
+    task: dict[str, Any]
+    flights_saved: int  # the first ones
+
+    def flights(self) -> dict[int, list[Record]]:
+        """Seeds whose flight was saved -> records of its vehicles."""
+        return dict(islice(by_flight(self.evaluation.records).items(), self.flights_saved))
+
+
+class Run(NamedTuple):
+    """A results folder."""
+
+    folder: Path
+    config: dict[str, Any]
+    suite: Suite
+    finished: tuple[Finished, ...]
+    units: int  # that the suite has
+    failures: tuple[str, ...] = ()  # policies from outside that did not fly, and why
+
+    def environments(self) -> list[tuple[EnvChoice, Results, list[Finished]]]:
+        """Environments of which something is flown, each with its table and its units."""
+        out = []
+        flown = [one for env in self.suite.envs for one in self.suite.flown(env).values()]
+        for env in flown:
+            here = [one for one in self.finished if one.unit.env.title == env.title]
+            if here:
+                out.append((env, _results(self.suite, env, here), here))
+        return out
+
+
+def _results(suite: Suite, env: EnvChoice, here: Sequence[Finished]) -> Results:
+    """The table of one environment, with the policies that have been flown there."""
+    policies = tuple(replace(one.unit.policy, envs=()) for one in here)  # `envs` may name others than this
+    base = suite.base if suite.base in [policy.title for policy in policies] else ""
+    part = Suite(suite.name, (env,), policies, suite.episodes, suite.seed, base)
+    return Results(part, tuple(one.evaluation for one in here))
+
+
+def task_facts(task: BaseTask) -> dict[str, Any]:
+    """Parameters of a task for the report, as plain numbers: all but the layout of the observation."""
+    facts = {key: value for key, value in asdict(task).items() if key != "layout"}
+    derived = {
+        "constraint_names": task.constraint_names,
+        "force_max": task.force_max.tolist(),
+        "hover_force": task.hover_force,
+        "rotors": (task.params.rotor_positions() / task.params.arm).tolist(),
+        "tolerance": TOLERANCE,
+        "mission": task.mission if isinstance(task, TeamTask) else "tracking",
+    }
+    plain: dict[str, Any] = plain_json(facts | derived)
+    return plain
+
+
+def read_run(folder: Path) -> Run:
+    """Read a results folder, finished or not.
+
+    Raises:
+        ResultsError: If there is none, nothing in it is finished, or another version has written it.
+    """
+    if not (folder / "config.json").is_file():
+        what = "is not a results folder: it has no config.json" if folder.is_dir() else "does not exist"
+        raise ResultsError(
+            f"{str(folder)!r} {what}; make one with: quad-envs benchmark --out FOLDER, or "
+            "quad-envs evaluate ENV POLICY --out FOLDER"
+        )
+    config = read_json(folder / "config.json")
+    _check_format(folder, config)
+    try:
+        suite = Suite.from_dict(config["suite"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ResultsError(f"the suite in {str(folder / 'config.json')!r} is not valid: {error}") from error
+    units = suite_units(suite, folder / "episodes", suite.episodes)
+    finished = tuple(
+        _finished(unit, folder / "cells" / unit.file_name)
+        for unit in units
+        if (folder / "cells" / unit.file_name).exists()
+    )
+    if not finished:
+        raise ResultsError(
+            f"nothing in {str(folder)!r} is finished yet; run the same command again: it "
+            "goes on where it stopped"
+        )
+    return Run(folder, config, suite, finished, len(units), _failures(folder))
+
+
+def _failures(folder: Path) -> tuple[str, ...]:
+    """What failures.json says; a folder of before has none."""
+    path = folder / FAILURES
+    found = read_json(path) if path.is_file() else []
+    try:
+        return tuple(f"{one['policy']} did not fly in {one['env']}: {one['message']}" for one in found)
+    except (KeyError, TypeError) as error:
+        raise ResultsError(f"{str(path)!r} is not ours ({error!r}); delete it") from error
+
+
+def read_contenders(folder: Path) -> dict[str, list[dict[str, str]]]:
+    """Rows of contenders.csv by the title of the environment as flown; none where nothing was trained."""
+    path = folder / "contenders.csv"
+    out: dict[str, list[dict[str, str]]] = {}
+    if not path.is_file():
+        return out
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                title = f"{row['env']}, {row['condition']}" if row["condition"] else row["env"]
+                out.setdefault(title, []).append(row)
+    except (csv.Error, KeyError, ValueError) as error:
+        raise ResultsError(f"{str(path)!r} is not ours ({error!r}); delete it") from error
+    return out
+
+
+def _check_format(folder: Path, config: Any) -> None:
+    """Refuse what this version cannot read."""
+    if not isinstance(config, Mapping) or not isinstance(config.get("suite"), Mapping):
+        raise ResultsError(
+            f"{str(folder / 'config.json')!r} is not that of a results folder; choose another one"
+        )
+    found = config.get("format", 1)
+    if found != RESULTS_FORMAT:
+        version = dict(config.get("versions") or {}).get("quad-envs", "?")
+        raise ResultsError(
+            f"{str(folder)!r} has results of format {found}, written by quad-envs {version}, and this "
+            f"version reads format {RESULTS_FORMAT}: fly them again with --fresh, or make the report with "
+            "the version that wrote them"
+        )
+
+
+def _finished(unit: Unit, path: Path) -> Finished:
+    """What a cell says of a unit."""
+    cell = read_json(path)
+    try:
+        found = Evaluation.from_plain(cell["found"])
+        return Finished(unit, found, dict(cell["task"]), int(cell["flights_saved"]))
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ResultsError(
+            f"{str(path)!r} is not a finished unit ({error!r}); delete it to fly this unit again"
+        ) from error

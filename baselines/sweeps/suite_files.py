@@ -1,0 +1,224 @@
+"""Suites as TOML files.
+
+name = "mine"
+episodes = 10
+seed = 0
+compare_with = "lmpc"        # label of the policy from which differences are taken
+
+envs = "all"                 # or a list of ids, or of tables
+[[policies]]
+name = "sdc-nmpc"
+label = "sdc-nmpc, N 15"
+kwargs = {horizon = 15}
+[[policies]]
+name = "mypolicy:make"       # module:factory of your own, or an entry point of an installed package
+[[policies]]
+name = "ppo"                 # an algorithm: one network is trained in each environment and with each seed
+train = {seeds = [0, 1, 2], steps = 4_000_000}
+[[policies]]
+name = "ppo"                 # the network that comes with the suite
+shipped = true
+[[conditions]]               # each environment is flown in each; networks are trained without them
+label = "2.45 N"
+kwargs = {kappa = 0.3125}
+
+"all" means the tracking ids, or policies. Multi-agent ids are named, and a policy that is not for all of the
+suite's environments says for which it is: `envs = ["quad/Formation-v0"]`, ids or labels. So do conditions.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from importlib import resources
+from pathlib import Path
+from typing import Any, TypeVar
+
+from quad_envs.names import shown, unknown_name
+from quad_envs.registration import TEAMS, TRACKING
+
+from ..policies.registry import TEAM_POLICIES, TRACKING_POLICIES, from_outside
+from ..policies.trained import names_trained
+from ..training.algorithms import ALGORITHMS
+from .suite import Condition, EnvChoice, PolicyChoice, Suite, Training
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+_Choice = TypeVar("_Choice", EnvChoice, PolicyChoice, Condition)
+_KEYS = {EnvChoice: "id", PolicyChoice: "name", Condition: "label"}
+
+
+def suite_from_dict(data: Mapping[str, Any], name: str = "suite") -> Suite:
+    """A suite from the values of a TOML file.
+
+    Raises:
+        ValueError: If a key is unknown, one that is needed is missing, or a value is not allowed.
+    """
+    known = [entry.name for entry in fields(Suite)]
+    for key in data:
+        if key not in (*known, "description"):
+            raise ValueError(unknown_name(f"key of suite {name!r}:", key, known))
+    for key in ("envs", "policies"):
+        if key not in data:
+            raise ValueError(f'suite {name!r} needs {key}: a list of tables, or "all"')
+    given = {key: value for key, value in data.items() if key != "description"}
+    envs, policies = given["envs"], given["policies"]
+    given["envs"] = _choices(EnvChoice, list(TRACKING) if envs == "all" else envs, name)
+    every = list(TRACKING_POLICIES) if policies == "all" else policies
+    given["policies"] = _choices(PolicyChoice, every, name)
+    given["conditions"] = _choices(Condition, given.get("conditions", ()), name)
+    return Suite(**{"name": name, **given})
+
+
+def _choices(kind: type[_Choice], entries: Any, suite: str) -> tuple[_Choice, ...]:
+    """The tables of a list; a policy that is trained with several seeds is several."""
+    key = _KEYS[kind]
+    if not isinstance(entries, Sequence) or isinstance(entries, str):
+        raise ValueError(
+            f'suite {suite!r}: choose from a list of tables with {key!r}, or "all"; got {shown(entries)}'
+        )
+    out: list[_Choice] = []
+    for entry in entries:
+        if not isinstance(entry, str | Mapping):
+            raise ValueError(
+                f"suite {suite!r}: choose by name or by a table with {key!r}, got {shown(entry)}"
+            )
+        table = _checked({key: entry} if isinstance(entry, str) else dict(entry), kind, suite)
+        if "train" in table:
+            out.extend(kind(**{**table, "train": training}) for training in _trainings(table["train"], suite))
+        else:
+            out.append(kind(**table))
+    return tuple(out)
+
+
+def _checked(table: dict[str, Any], kind: type[Any], suite: str) -> dict[str, Any]:
+    """A table whose keys are known and whose values are of the right kind."""
+    key, known = _KEYS[kind], [entry.name for entry in fields(kind)]
+    for name in table:
+        if name not in known:
+            raise ValueError(unknown_name(f"key in suite {suite!r}:", name, known))
+    if key not in table:
+        raise ValueError(f"suite {suite!r}: each table needs {key!r}, got {table}")
+    if not isinstance(table[key], str):
+        raise ValueError(f"suite {suite!r}: {key} must be text, got {shown(table[key])}")
+    if table.get("train", 0) is None:
+        del table["train"]
+    allowed = _allowed(kind, table)
+    if allowed is not None and table[key] not in allowed and not _is_users(kind, table[key]):
+        raise ValueError(unknown_name(f"{key} in suite {suite!r}:", table[key], allowed))
+    if not isinstance(table.get("kwargs", {}), Mapping):
+        raise ValueError(
+            f"suite {suite!r}: kwargs of {table[key]!r} must be a table, as {{horizon = 15}}, "
+            f"got {table['kwargs']!r}"
+        )
+    if not isinstance(table.get("label", ""), str):
+        raise ValueError(f"suite {suite!r}: the label of {table[key]!r} must be text, got {table['label']!r}")
+    if not isinstance(table.get("shipped", False), bool):
+        raise ValueError(
+            f"suite {suite!r}: shipped of {table[key]!r} must be true or false, got {shown(table['shipped'])}"
+        )
+    if table.get("envs"):
+        table["envs"] = _names(table["envs"], table[key], suite)
+    else:
+        table.pop("envs", None)
+    return table
+
+
+def _is_users(kind: type[Any], name: Any) -> bool:
+    """Whether a name is one of the user's: a checkpoint, `module:factory`, an entry point, `module:id`."""
+    if kind is PolicyChoice and from_outside(name):
+        return True
+    return names_trained(name) or (kind is EnvChoice and ":" in name)
+
+
+def _allowed(kind: type[Any], table: Mapping[str, Any]) -> list[str] | None:
+    """Names that a choice may have; None for any."""
+    if kind is EnvChoice:
+        return [*TRACKING, *TEAMS]
+    if kind is Condition:
+        return None
+    if "train" in table or table.get("shipped"):
+        return list(ALGORITHMS)
+    return list(dict.fromkeys([*TRACKING_POLICIES, *TEAM_POLICIES]))
+
+
+def _trainings(table: Any, suite: str) -> list[Training]:
+    """One training per seed."""
+    known = [entry.name for entry in fields(Training)]
+    if not isinstance(table, Mapping):
+        raise ValueError(f"suite {suite!r}: train must be a table, as {{seeds = [0, 1]}}, got {shown(table)}")
+    for name in table:
+        if name not in (*known, "seeds"):
+            raise ValueError(unknown_name(f"key of train in suite {suite!r}:", name, [*known, "seeds"]))
+    given = {name: value for name, value in table.items() if name != "seeds"}
+    if not isinstance(given.get("hyper", {}), Mapping):
+        raise ValueError(
+            f"suite {suite!r}: hyper of a training must be a table, as {{rows = 64}}, "
+            f"got {shown(given['hyper'])}"
+        )
+    seeds = table.get("seeds", [given.pop("seed", 0)])
+    if not isinstance(seeds, Sequence) or isinstance(seeds, str) or not seeds:
+        raise ValueError(
+            f"suite {suite!r}: seeds of a training must be a list, as [0, 1], got {shown(seeds)}"
+        )
+    return [Training(**{**given, "seed": seed}) for seed in seeds]
+
+
+def _names(value: Any, who: str, suite: str) -> tuple[str, ...]:
+    """The environments of a policy or a condition."""
+    if not isinstance(value, list | tuple) or not all(isinstance(name, str) for name in value):
+        raise ValueError(
+            f"suite {suite!r}: envs of {who!r} must be a list of ids or labels, got {shown(value)}; without "
+            "it all are meant"
+        )
+    return tuple(value)
+
+
+def suite_names() -> dict[str, str]:
+    """Shipped suites and what they are."""
+    files = sorted(resources.files("baselines").joinpath("suites").iterdir(), key=lambda file: file.name)
+    toml = [file for file in files if file.name.endswith(".toml")]
+    return {
+        file.name[:-5]: str(tomllib.loads(file.read_text("utf-8")).get("description", "")) for file in toml
+    }
+
+
+def load_suite(source: str | Path | Mapping[str, Any] | Suite) -> Suite:
+    """A shipped suite by name, one from a TOML file, from a mapping, or as it is.
+
+    Raises:
+        ValueError: If it does not exist or is not valid.
+    """
+    if isinstance(source, Suite):
+        return source
+    if isinstance(source, Mapping):
+        return suite_from_dict(source)
+    path = Path(source)
+    if path.suffix == ".toml":
+        if not path.is_file():
+            raise ValueError(
+                f"there is no suite file {str(path)!r}; shipped suites: {', '.join(suite_names())}"
+            )
+        return _read_suite(path)
+    if str(source) not in suite_names():
+        raise ValueError(unknown_name("suite", str(source), suite_names()) + "; or the path of a .toml file")
+    text = resources.files("baselines").joinpath("suites", f"{source}.toml").read_text("utf-8")
+    return suite_from_dict(tomllib.loads(text), path.stem)
+
+
+def _read_suite(path: Path) -> Suite:
+    """The suite of a file; every complaint names the file."""
+    try:
+        return suite_from_dict(tomllib.loads(path.read_text("utf-8")), path.stem)
+    except OSError as error:
+        raise ValueError(f"cannot read suite file {str(path)!r}: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"suite file {str(path)!r} is not valid TOML: {error}") from error
+    except RecursionError:
+        raise ValueError(f"suite file {str(path)!r} has brackets nested too deeply to be read") from None
+    except ValueError as error:
+        raise ValueError(f"suite file {str(path)!r}: {error}") from error

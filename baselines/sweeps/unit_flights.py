@@ -1,0 +1,134 @@
+"""Fly one unit of a suite, and what is kept of it: its numbers as a cell, its flights as arrays."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_envs.tasks import TeamTask
+
+from ..errors import ResultsError
+from ..evaluation.episode import Episode
+from ..evaluation.evaluate import fly_and_measure
+from ..files import write_atomic
+from ..policies.environments import make_env
+from ..policies.registry import from_outside, make_policy, policy_name
+from .folder import task_facts
+from .units import Unit
+
+
+def fly_unit(unit: Unit) -> dict[str, Any]:
+    """Fly one unit; the form in which it is stored in cells/, or what went wrong as "failure".
+
+    A policy from outside that breaks off is a finding of the sweep, whose other units go on.
+    """
+    try:
+        return _fly(unit)
+    except ResultsError:
+        raise
+    except ValueError as error:
+        if not from_outside(unit.source):
+            raise
+        return {"failure": str(error)}
+
+
+def _fly(unit: Unit) -> dict[str, Any]:
+    begin = perf_counter()
+    env = unit.given.env
+    if env is None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # said once before the first unit
+            env = make_env(unit.env.id, **unit.env.kwargs)
+    policy = make_policy(unit.source, env, **unit.policy.kwargs)
+    save = None if unit.episode_folder is None else _saver(unit, env)
+
+    def on_episode(episode: Episode) -> None:
+        for hear in (save, unit.given.on_episode):
+            if hear is not None:
+                hear(episode)
+
+    found = fly_and_measure(
+        policy, env, unit.episodes, unit.seed, on_episode=on_episode, mismatch=unit.given.mismatch
+    )
+    if unit.given.policy is None:
+        found = replace(found, policy=policy_name(policy, unit.policy_name))
+    if unit.given.env is None:
+        env.close()
+    seconds = perf_counter() - begin
+    return {
+        "env": unit.env.title,
+        "policy": unit.policy.title,
+        "seconds": seconds,
+        "task": task_facts(env.unwrapped.task),
+        "flights_saved": len(unit.episode_files()),
+        "found": found.to_plain(),
+    }
+
+
+def _saver(unit: Unit, env: Any) -> Callable[[Episode], None]:
+    """Writes the flights that are wanted to episodes/, each when all vehicles of a team have given theirs."""
+    team: list[Episode] = []
+
+    def save(episode: Episode) -> None:
+        team.append(episode)
+        if len(team) < episode.team_size:
+            return
+        arrays: dict[str, Any] = flight_arrays(team) | _shared_arrays(env)
+        team.clear()
+        path = unit.episode_file(episode.seed)
+        if path is None:
+            return
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **arrays)
+        write_atomic(path, buffer.getvalue())
+
+    return save
+
+
+def _shared_arrays(env: Any) -> dict[str, NDArray[Any]]:
+    """What a team has in common in the flight that just ended: the target's rows r, v, and who hears whom.
+
+    `graphs` (M, N, N) are the weights that hold at some step, and `graph_of_step` (T+1,) says which.
+    """
+    task = env.unwrapped.task
+    if not isinstance(task, TeamTask):
+        return {}
+    found = {"graphs": env.unwrapped.graphs.graphs, "graph_of_step": env.unwrapped.graphs.which}
+    return found | ({"target": env.unwrapped.target} if task.layout.target else {})
+
+
+def flight_arrays(team: Sequence[Episode]) -> dict[str, NDArray[Any]]:
+    """The arrays of a flight in the form of episodes/*.npz.
+
+    Of one vehicle those of its Episode. Of a team the same and its signals, stacked with the vehicles first,
+    with `agent` their names and `lengths` the steps that each flew: what lies behind, where one left early,
+    is nan, or zero where there are only whole numbers.
+    """
+    plain = [
+        {key: value for key, value in episode._asdict().items() if isinstance(value, np.ndarray)}
+        | {key: np.asarray(value) for key, value in episode.signals.items()}
+        for episode in team
+    ]
+    if not team[0].agent:
+        return plain[0]
+    out = {key: _stack_ragged([arrays[key] for arrays in plain]) for key in plain[0]}
+    out["agent"] = np.array([episode.agent for episode in team])
+    out["lengths"] = np.array([len(episode.rewards) for episode in team])
+    out["crashed"] = np.array([episode.crashed for episode in team])
+    return out
+
+
+def _stack_ragged(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    longest = max(len(array) for array in arrays)
+    fill = np.nan if np.issubdtype(arrays[0].dtype, np.floating) else 0
+    out = np.full((len(arrays), longest, *arrays[0].shape[1:]), fill, dtype=arrays[0].dtype)
+    for row, array in zip(out, arrays, strict=True):
+        row[: len(array)] = array
+    return out

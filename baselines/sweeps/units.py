@@ -1,0 +1,133 @@
+"""What a benchmark does in one piece: it trains a network, or flies a policy in an environment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..evaluation.episode import Episode
+from .suite import EnvChoice, PolicyChoice, Suite, Training, is_for
+
+
+class TrainingUnit(NamedTuple):
+    """A network to train."""
+
+    number: int
+    env: EnvChoice  # without conditions
+    policy: PolicyChoice
+    folder: Path
+
+    @property
+    def training(self) -> Training:
+        """Its seed, budget and hyperparameters."""
+        assert self.policy.train is not None
+        return self.policy.train
+
+
+class Given(NamedTuple):
+    """Objects that fly and that no name in a suite stands for; a program that goes on later has others."""
+
+    policy: Any = None  # with `predict`, or a factory; None: the name in the suite
+    env: Any = None  # None: the id in the suite
+    on_episode: Callable[[Episode], None] | None = None  # called with each flight
+    mismatch: bool = False  # whether the policy may be one of another task on purpose
+
+
+class Unit(NamedTuple):
+    """A policy to fly in an environment."""
+
+    number: int
+    env: EnvChoice
+    policy: PolicyChoice
+    policy_name: str  # for make_policy
+    episodes: int
+    seed: int
+    episode_folder: Path | None  # where to save flights
+    flights_saved: int = 0  # how many, the first ones
+    given: Given = Given()
+
+    @property
+    def named(self) -> bool:
+        """Whether names alone say what is flown, so that a stored result stands for it."""
+        return all(value is None or value is False for value in self.given)
+
+    @property
+    def source(self) -> Any:
+        """The policy, or its name for `make_policy`."""
+        return self.policy_name if self.given.policy is None else self.given.policy
+
+    @property
+    def file_name(self) -> str:
+        """Name of its file in cells/."""
+        return f"{self.number:03d}-{_slug(f'{self.env.title}--{self.policy.title}')}.json"
+
+    def episode_file(self, seed: int) -> Path | None:
+        """File of the flight with a seed; None if it is not saved."""
+        if self.episode_folder is None or seed >= self.seed + self.flights_saved:
+            return None
+        return self.episode_folder / f"{self.file_name.removesuffix('.json')}-{seed}.npz"
+
+    def episode_files(self) -> list[Path]:
+        """Files of its flights that are saved."""
+        files = (self.episode_file(self.seed + i) for i in range(self.episodes))
+        return [file for file in files if file is not None]
+
+
+def _slug(text: str) -> str:
+    return "".join(c if c.isalnum() else "-" for c in text)[:80]
+
+
+def _trained_folder(env: EnvChoice, policy: PolicyChoice, networks: Path) -> Path:
+    """Where the network of a policy for an environment is."""
+    return networks / _slug(f"{env.title}--{policy.title}")
+
+
+def training_units(suite: Suite, networks: Path = Path("networks")) -> list[TrainingUnit]:
+    """All networks that the suite trains: one for each environment in which a trained policy flies.
+
+    Args:
+        suite: The suite.
+        networks: Folder of all of them.
+    """
+    pairs = [
+        (env, policy)
+        for policy in suite.policies
+        for env in suite.envs
+        if policy.train is not None and is_for(policy.envs, env)
+    ]
+    return [TrainingUnit(i, *pair, _trained_folder(*pair, networks)) for i, pair in enumerate(pairs)]
+
+
+def suite_units(
+    suite: Suite,
+    episodes: Path | None = None,
+    flights_saved: int = 0,
+    networks: Path = Path("networks"),
+) -> list[Unit]:
+    """All environments x conditions x policies that are for them.
+
+    Args:
+        suite: The suite.
+        episodes: Folder in which flights are saved; None if they are not.
+        flights_saved: How many of each unit, the first ones.
+        networks: Folder of the networks that the suite trains.
+    """
+    units: list[Unit] = []
+    for env in suite.envs:
+        policies = [policy for policy in suite.policies if is_for(policy.envs, env)]
+        for flown in suite.flown(env).values():
+            for policy in policies:
+                name, number = _policy_name(env, policy, networks), len(units)
+                flights = suite.episodes, suite.seed, episodes, flights_saved
+                units.append(Unit(number, flown, policy, name, *flights))
+    return units
+
+
+def _policy_name(env: EnvChoice, policy: PolicyChoice, networks: Path) -> str:
+    """Name or path of a policy for one environment."""
+    from ..policies.trained import shipped_name
+
+    if policy.train is not None:
+        return str(_trained_folder(env, policy, networks))
+    return shipped_name(policy.name, env.id) if policy.shipped else policy.name

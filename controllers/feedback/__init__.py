@@ -1,0 +1,1 @@
+"""Feedback laws without prediction: SDRE, LQR, feedback linearization."""

@@ -1,0 +1,1 @@
+"""Model predictive control of one vehicle: linear, state-dependent and exact."""

@@ -1,0 +1,576 @@
+"""One sample of an MPC in compiled form: what comes before the solve, the fallbacks, and what comes after it.
+
+The flavours (`lmpc.py`, `sdc_nmpc.py`, `nmpc.py`) add how the pairs (A_i, B_i) and affine terms c_i are made.
+
+Memory of one vehicle: whether a plan is held, the plan's rotor commands (N x 4), the solver's working set
+(N), then, with `reject_disturbance`, the estimator's ESTIMATOR_SIZE numbers, then what the flavour keeps.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from quad_envs._numba import kernel
+from quad_envs.parameters import HOVER_FORCE, N_INPUT, N_STATE, Array
+from quad_envs.rotations import sincos, wrap_angle_scalar
+from quad_envs.tasks import BaseTask
+from quad_envs.turning import turn_rate
+
+from ..disturbance import ESTIMATOR_SCRATCH, N_DISTURBANCE, feed_forward, remember, update_estimate
+from ..fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXED_WEIGHT, limit_command
+from ..qp.active_set import INACCURATE, INFEASIBLE, OPTIMAL
+from ..qp.linalg import copy
+from ..qp.ocp import IntArray
+from ..qp.riccati import DARE_SCRATCH
+from ..qp.structured import Workspace, solve_structured
+from ..qp.working_set import pack_working_set, unpack_working_set
+from .present_axes import body_outputs
+
+MEMORY_STAGE = N_INPUT + 1  # numbers that a plan and its working set take per stage
+
+
+FROZEN_SPAN = 0.5  # rad, of roll, pitch or yaw, for which the pair taken at a state still serves
+_ROOM = 1e-3  # rad beyond, which a solver may leave of an active row
+GOVERNOR_REACH = 6.0  # m: beyond the starts of every id; a linear model asked for 15 m flips the vehicle
+_CLOSE = 1e-4  # of the largest force, and of a row: below what a model knows, above what round-off leaves
+
+
+class MpcData(NamedTuple):
+    """Constants of one controller, for compiled code."""
+
+    coefficients: Array  # (N_COEFFICIENTS,)
+    B_c: Array  # (12, 4)
+    Q: Array  # (1, 12, 12)
+    R: Array  # (4, 4)
+    R_rate: Array  # (4, 4), or (0, 4) for none
+    P: Array  # (12, 12), weight of x_N: solves the Riccati equation of the hover pair
+    normals: Array  # (H, 12), outputs with limits
+    axis: IntArray  # (H,), 0..2 where the output is that coordinate of the position, else -1
+    normal: IntArray  # (K,)
+    stage: IntArray  # (K,)
+    lower: Array  # (K,)
+    upper: Array  # (K,)
+    weight: Array  # (K,)
+    dt: float
+    force_max: Array  # (4,), N
+    rate_step: float
+    lag: float  # of slow rotors, s, see `rotor_lag`
+    gain: Array  # (6,), of the disturbance estimator, 0 for none
+    heading: bool  # whether the problem is posed at the present position and heading
+    attitude: bool  # whether v_ref is turned into the present body axes
+    level: bool  # whether the model's velocity stands in level axes, as v_ref, instead of in body axes
+    present: bool  # whether it stands in those of the present attitude, which do not turn along a plan
+    kinematics: bool  # whether the model turns body rates into Euler rates at the present attitude
+    iteration_limit: int
+    plan_bound: Array  # (12,), magnitude of each state where the plan's own rows begin, inf for none
+    own_outputs: int  # outputs and rows of the task's limits, which stand first
+    own_rows: int
+    model_tilt: float  # rad, roll and pitch up to which the model holds
+    first_angle: int  # of the state, of those that may not leave the point of the model: 6 (all) or 8 (yaw)
+
+
+class Scratch(NamedTuple):
+    """One sample's problem and the memory to make it, carved from one flat buffer."""
+
+    x_0: Array  # (12,)
+    trim: Array  # (12,), equilibrium under the disturbance
+    offset: Array  # (4,), equilibrium rotor forces; u = F - offset
+    lower: Array  # (4,), of u
+    upper: Array  # (4,)
+    u_last: Array  # (4,)
+    d: Array  # (6,), disturbance in the axes of the problem
+    estimate: Array  # (6,), of what is not revealed
+    r: Array  # (N+1, 12)
+    c: Array  # (N, 12)
+    A: Array  # (1 or N, 12, 12)
+    B: Array  # (1 or N, 12, 4)
+    normals: Array  # (H, 12)
+    row_lower: Array  # (K,)
+    row_upper: Array  # (K,)
+    weight: Array  # (K,)
+    A_c: Array  # (12, 12)
+    P: Array  # (12, 12)
+    square: Array  # (DARE_SCRATCH, 12, 12)
+    work: Array  # (ESTIMATOR_SCRATCH,)
+    working: Array  # (N,), working set of the solver, one number per stage
+    Q: Array  # (M, 12, 12), stage weights; M = N where a guess is kept, else 0
+    target: Array  # (M+1, 12), references that go with them
+    X: Array  # (M+1, 12), guess of the states
+    F: Array  # (M, 4), and of the rotor forces
+    points: Array  # (1 or N, 12), states at which the pairs were taken; hover: zeros
+
+
+def buffer_size(N: int, pairs: int, H: int, K: int, M: int) -> int:
+    """Numbers that `carve` needs."""
+    n, m = N_STATE, N_INPUT
+    vectors = 2 * n + 4 * m + 2 * N_DISTURBANCE + ESTIMATOR_SCRATCH
+    stages = n * (2 * N + 1) + pairs * n * (n + m) + n * H + 3 * K
+    guess = M * n * n + 2 * n * (M + 1) + m * M
+    return vectors + N + stages + (2 + DARE_SCRATCH) * n * n + guess + pairs * n
+
+
+@kernel
+def copy_vector(x: Array, out: Array) -> None:
+    """As `linalg.copy`, for vectors."""
+    for i in range(out.shape[0]):
+        out[i] = x[i]
+
+
+@kernel
+def _take(buffer: Array, start: int, rows: int, columns: int) -> Array:
+    """The next matrix of the buffer."""
+    return buffer[start : start + rows * columns].reshape(rows, columns)
+
+
+@kernel
+def carve(buffer: Array, N: int, pairs: int, H: int, K: int, M: int) -> Scratch:
+    """Views of the buffer; one array is unpacked at the call from Python instead of two dozen."""
+    n, m, e = N_STATE, N_INPUT, N_DISTURBANCE
+    v = _take(buffer, 0, 1, 2 * n + 4 * m + 2 * e + ESTIMATOR_SCRATCH)[0]
+    i = v.shape[0]
+    working = _take(buffer, i, 1, N)[0]
+    i += N
+    r = _take(buffer, i, N + 1, n)
+    i += r.size
+    c = _take(buffer, i, N, n)
+    i += c.size
+    A = _take(buffer, i, pairs * n, n).reshape(pairs, n, n)
+    i += A.size
+    B = _take(buffer, i, pairs * n, m).reshape(pairs, n, m)
+    i += B.size
+    square = _take(buffer, i, (2 + DARE_SCRATCH) * n, n).reshape(2 + DARE_SCRATCH, n, n)
+    i += square.size
+    normals = _take(buffer, i, H, n)
+    i += normals.size
+    rows = _take(buffer, i, 3, K)
+    i += rows.size
+    Q = _take(buffer, i, M * n, n).reshape(M, n, n)
+    i += Q.size
+    target = _take(buffer, i, M + 1, n)
+    i += target.size
+    X = _take(buffer, i, M + 1, n)
+    i += X.size
+    F = _take(buffer, i, M, m)
+    points = _take(buffer, i + F.size, pairs, n)
+    o = 2 * n + 4 * m
+    return Scratch(
+        v[:n], v[n : 2 * n], v[2 * n : 2 * n + m], v[2 * n + m : 2 * n + 2 * m],
+        v[2 * n + 2 * m : 2 * n + 3 * m], v[2 * n + 3 * m : o], v[o : o + e], v[o + e : o + 2 * e],
+        r, c, A, B, normals, rows[0], rows[1], rows[2], square[0], square[1], square[2:], v[o + 2 * e :],
+        working, Q, target, X, F, points,
+    )  # fmt: skip
+
+
+@kernel
+def set_state(plant: Array, heading: bool, x_0: Array) -> None:
+    """The measured state in the frame of the problem: with `heading`, p = 0 and psi = 0."""
+    for i in range(N_STATE):
+        x_0[i] = plant[i]
+    if heading:
+        x_0[0], x_0[1], x_0[2], x_0[8] = 0.0, 0.0, 0.0, 0.0
+
+
+@kernel
+def level_velocity(x_0: Array) -> None:
+    """V_B of x_0 becomes the velocity in level axes, in place: what the hover model takes for p'.
+
+    Near hover both axes are one, and the matrices are the same. But a vehicle that climbs at 3 m/s and rolls
+    by 0.1 rad has 0.3 m/s of lateral V_B and does not move sideways: predicted from V_B, it would drift by
+    that, the farther the longer the horizon.
+    """
+    sf, cf = sincos(x_0[6])
+    st, ct = sincos(x_0[7])
+    u, v, w = x_0[3], x_0[4], x_0[5]
+    under = sf * v + cf * w
+    x_0[3], x_0[4], x_0[5] = ct * u + st * under, cf * v - sf * w, ct * under - st * u
+
+
+@kernel
+def add_rotor_lag(plant: Array, offset: Array, B_c: Array, lag: float, x_0: Array) -> None:
+    """What slow rotors will still do: x_0 + B_c (F - offset) / lambda_F.
+
+    The models have no rotor lag. With it, x' = A x + B_c F and F' = lambda_F (u - F), so that
+    z = x + B_c F / lambda_F moves by z' = A x + B_c u: seen from z, the rotors answer at once.
+
+    Args:
+        plant: [p, V_B, Theta, Omega, F], (16,).
+        offset: Rotor forces in equilibrium, (4,), N.
+        B_c: QuadrotorParams.input_matrix(), (12, 4).
+        lag: 1 / lambda_F, s, or 0 for x_0 as it is; see `rotor_lag`.
+        x_0: State of the problem, (12,), changed in place.
+    """
+    if lag > 0.0:
+        for i in range(3, N_STATE):
+            for a in range(N_INPUT):
+                x_0[i] += lag * B_c[i, a] * (plant[N_STATE + a] - offset[a])
+
+
+def rotor_lag(task: BaseTask) -> float:
+    """1 / lambda_F, s, where that is longer than half a control period; else 0: the lag may be left out.
+
+    The dissertation's rotors take 20 ms of 50 ms, and its controllers know nothing of it. Of a vehicle with
+    65 ms (`vehicle="crazyflie"`), the ones on the hover model lose control.
+    """
+    rate = task.params.rotor_rate
+    return 1.0 / rate if rate * task.dt < 2.0 else 0.0
+
+
+@kernel
+def governed(x: float, y: float, z: float) -> float:
+    """Share of a position error (x, y, z), m, that a controller is shown: all of it up to GOVERNOR_REACH."""
+    distance = math.sqrt(x * x + y * y + z * z)
+    return 1.0 if distance <= GOVERNOR_REACH else GOVERNOR_REACH / distance
+
+
+@kernel
+def set_references(
+    plant: Array,
+    window: Array,
+    trim: Array,
+    heading: bool,
+    attitude: bool,
+    kinematics: bool,
+    stages: int,
+    dt: float,
+    r: Array,
+) -> None:
+    """Rows r_i = [p_ref; v_ref; trim phi, theta; psi_ref; Omega_ref] in the frame of the problem.
+
+    The slot of V_B holds v_ref turned by the present heading, or by the whole present attitude, or (frame
+    "hover", as in the dissertation) as it stands in inertial axes. psi_ref goes on continuously from row to
+    row; the first is the one nearest to psi with `heading`, and in (-pi, pi] without. Omega_ref is [0, 0,
+    psi_dot], or (`kinematics`) E(Theta) [0, 0, psi_dot] at the present attitude: what the model, at hover or
+    frozen, needs to turn with the heading.
+
+    With `heading`, a window that begins farther than GOVERNOR_REACH from the vehicle is moved towards it as a
+    whole; the dissertation's frame has no such governor.
+
+    Args:
+        plant: Measured, (16,).
+        window: (>= n, 8).
+        trim: Attitude in equilibrium, (12,).
+        heading: Whether the frame is turned and shifted to the vehicle.
+        attitude: Whether v_ref is turned into the present body axes.
+        kinematics: Whether Omega_ref is.
+        stages: Rows of the window that may be read, for psi_dot.
+        dt: Control period, s.
+        r: Result, (n, 12).
+    """
+    psi = plant[8]
+    sine, cosine = sincos(psi if heading else 0.0)
+    sf, cf, st, ct = 0.0, 1.0, 0.0, 1.0
+    sv, cv = sine, cosine
+    if attitude:
+        sf, cf = sincos(plant[6])
+        st, ct = sincos(plant[7])
+        sv, cv = sincos(psi)
+    e9, e10, e11 = 0.0, 0.0, 1.0  # third column of E(Theta)
+    if kinematics:
+        roll_sine, roll_cosine = sincos(plant[6])
+        pitch_sine, pitch_cosine = sincos(plant[7])
+        e9, e10, e11 = -pitch_sine, roll_sine * pitch_cosine, roll_cosine * pitch_cosine
+    yaw = 0.0
+    for i in range(r.shape[0]):
+        if i == 0:
+            yaw = math.atan2(window[0, 6], window[0, 7])
+            if heading:
+                yaw = wrap_angle_scalar(yaw - psi)
+        elif window[i, 6] != window[i - 1, 6] or window[i, 7] != window[i - 1, 7]:
+            turn_sine = window[i, 6] * window[i - 1, 7] - window[i, 7] * window[i - 1, 6]
+            turn_cosine = window[i, 7] * window[i - 1, 7] + window[i, 6] * window[i - 1, 6]
+            yaw = (
+                yaw + math.atan2(turn_sine, turn_cosine)
+                if heading
+                else math.atan2(window[i, 6], window[i, 7])
+            )
+        x, y, z = window[i, 0], window[i, 1], window[i, 2]
+        if heading:
+            x, y, z = x - plant[0], y - plant[1], z - plant[2]
+        u = cv * window[i, 3] + sv * window[i, 4]
+        v = cv * window[i, 4] - sv * window[i, 3]
+        w = window[i, 5]
+        down = st * u + ct * w
+        r[i, 0], r[i, 1], r[i, 2] = cosine * x + sine * y, cosine * y - sine * x, z
+        r[i, 3], r[i, 4], r[i, 5] = ct * u - st * w, sf * down + cf * v, cf * down - sf * v
+        r[i, 6], r[i, 7], r[i, 8] = trim[6], trim[7], trim[8] + yaw
+        psi_dot = turn_rate(window, stages, i, dt)
+        r[i, 9], r[i, 10], r[i, 11] = e9 * psi_dot, e10 * psi_dot, e11 * psi_dot
+    if heading:
+        x, y, z = r[0, 0], r[0, 1], r[0, 2]
+        rest = 1.0 - governed(x, y, z)
+        if rest > 0.0:
+            for i in range(r.shape[0]):
+                r[i, 0] -= rest * x
+                r[i, 1] -= rest * y
+                r[i, 2] -= rest * z
+
+
+@kernel
+def turn_rows(
+    plant: Array, axis: IntArray, normal: IntArray, normals: Array, lower: Array, upper: Array
+) -> None:
+    """Turn and shift the limits on the position with the frame, in place.
+
+    Args:
+        plant: Measured, (16,).
+        axis: Coordinate of the position that each output is, or -1, (H,).
+        normal: Output of each row, (K,).
+        normals: Outputs, (H, 12).
+        lower: Bounds, (K,).
+        upper: Bounds, (K,).
+    """
+    sine, cosine = sincos(plant[8])
+    for h in range(axis.shape[0]):
+        if axis[h] == 0:
+            normals[h, 0], normals[h, 1] = cosine, -sine
+        elif axis[h] == 1:
+            normals[h, 0], normals[h, 1] = sine, cosine
+    for k in range(normal.shape[0]):
+        if axis[normal[k]] >= 0:
+            lower[k] -= plant[axis[normal[k]]]
+            upper[k] -= plant[axis[normal[k]]]
+
+
+@kernel
+def begin_row(
+    plant: Array,
+    window: Array,
+    last: Array,
+    revealed: Array,
+    memory: Array,
+    which: IntArray | None,
+    data: MpcData,
+    s: Scratch,
+) -> None:
+    """One sample's problem but for the model: disturbance, equilibrium, state, reference, bounds, rows.
+
+    Without an estimator `which` is None, and its code is not even compiled; else zeros, (1,).
+    """
+    N = s.c.shape[0]
+    working = memory[1 + N_INPUT * N : 1 + MEMORY_STAGE * N]
+    for i in range(N):
+        s.working[i] = working[min(i + 1, N - 1)]
+    for i in range(N_DISTURBANCE):
+        s.estimate[i] = 0.0
+    if which is not None:
+        kept = memory[1 + MEMORY_STAGE * N :]
+        update_estimate(
+            plant, kept, data.gain, data.coefficients, data.dt, data.force_max, s.estimate, s.work, which
+        )
+    for i in range(N_DISTURBANCE):
+        s.d[i] = revealed[i] + s.estimate[i]
+    feed_forward(s.d, plant[8], data.coefficients, data.force_max, s.offset, s.trim)
+    if data.heading:
+        sine, cosine = sincos(plant[8])
+        s.d[3], s.d[4] = cosine * s.d[3] + sine * s.d[4], cosine * s.d[4] - sine * s.d[3]
+    set_state(plant, data.heading, s.x_0)
+    add_rotor_lag(plant, s.offset, data.B_c, data.lag, s.x_0)
+    if data.level:
+        level_velocity(s.x_0)
+    set_references(plant, window, s.trim, data.heading, data.attitude, data.kinematics, N + 1, data.dt, s.r)
+    for a in range(N_INPUT):
+        s.lower[a] = -s.offset[a]
+        s.upper[a] = data.force_max[a] - s.offset[a]
+        s.u_last[a] = last[a] - s.offset[a]
+    copy(data.normals, s.normals)
+    copy_vector(data.lower, s.row_lower)
+    copy_vector(data.upper, s.row_upper)
+    copy_vector(data.weight, s.weight)
+    if data.heading:
+        turn_rows(plant, data.axis, data.normal, s.normals, s.row_lower, s.row_upper)
+    if data.level or data.present:
+        body_outputs(plant, data.level, data.normal, s.normals, s.row_lower, s.row_upper)
+
+
+@kernel
+def hold_trim(A: Array, trim: Array, c: Array) -> None:
+    """c_i = trim - A_i trim, so that the equilibrium stays one in the model; zero without a lateral force.
+
+    Args:
+        A: (1 or N, 12, 12).
+        trim: (12,), of which only roll and pitch are not zero.
+        c: Result, (N, 12).
+    """
+    for i in range(c.shape[0]):
+        j = i if A.shape[0] > 1 else 0
+        for a in range(N_STATE):
+            c[i, a] = trim[a] - A[j, a, 6] * trim[6] - A[j, a, 7] * trim[7]
+
+
+@kernel
+def _widen(lower: Array, upper: Array) -> None:
+    """No bounds."""
+    for k in range(lower.shape[0]):
+        lower[k] = -math.inf
+        upper[k] = math.inf
+
+
+@kernel
+def _is_close(error: Array, force_max: Array) -> bool:
+    """Whether a plan that is optimal but for round-off may be flown; see `Workspace.error`."""
+    return bool(error[0] <= _CLOSE * force_max[0] and error[1] <= _CLOSE)
+
+
+@kernel
+def solve_row(
+    A: Array,
+    B: Array,
+    Q: Array,
+    Q_f: Array,
+    stationary: bool,
+    r: Array,
+    has_plan: bool,
+    H: int,
+    K: int,
+    data: MpcData,
+    s: Scratch,
+    ws: Workspace,
+) -> tuple[int, int]:
+    """Solve; hard rows that contradict each other become soft; failing that, without a plan, no constraints.
+
+    Only the first H normals and K rows count: where their number differs from vehicle to vehicle, the others
+    are left out. The solver starts from the working set in s.working and leaves its own there.
+
+    Returns:
+        Fallback (PREVIOUS_PLAN and HOVER leave no plan in ws.u), and active-set iterations.
+    """
+    level = NONE
+    iterations = 0
+    rate_step = data.rate_step
+    stage, n_rows = data.stage[:K], 4 * ws.u.size + 2 * K
+    warm = unpack_working_set(s.working, stage, ws.active, ws.guess[:n_rows])
+    for i in range(s.working.shape[0]):
+        s.working[i] = 0.0
+    while True:
+        status, count = solve_structured(
+            A, B, s.c, Q, data.R, Q_f, stationary, s.x_0, r, s.lower, s.upper, rate_step, s.u_last,
+            s.normals[:H], data.normal[:K], stage, s.row_lower[:K], s.row_upper[:K], s.weight[:K],
+            data.R_rate, data.iteration_limit, warm, ws,
+        )  # fmt: skip
+        iterations += count
+        close = status == INACCURATE and _is_close(ws.error, data.force_max)
+        if status == OPTIMAL or close:
+            if warm or iterations > 0:
+                pack_working_set(ws.state[:n_rows], stage, ws.active, s.working)
+            return level, iterations
+        if level == CLIPPED_SDRE:
+            return HOVER, iterations
+        if level == NONE and status == INFEASIBLE:
+            level = RELAXED
+            for k in range(s.weight.shape[0]):
+                s.weight[k] = min(s.weight[k], RELAXED_WEIGHT)
+        elif has_plan:
+            return PREVIOUS_PLAN, iterations
+        else:
+            level = CLIPPED_SDRE
+            warm = False
+            rate_step = math.inf
+            _widen(s.lower, s.upper)
+            _widen(s.row_lower, s.row_upper)
+
+
+@kernel
+def leaves_bound(x: Array, bound: Array) -> bool:
+    """Whether roll, pitch or a body rate of a plan (N+1, 12) is larger than its bound (12,)."""
+    for i in range(1, x.shape[0]):
+        for a in (6, 7, 9, 10, 11):
+            if abs(x[i, a]) > bound[a]:
+                return True
+    return False
+
+
+@kernel
+def leaves_tilt(x: Array, tilt: float) -> bool:
+    """Whether a plan (N+1, 12) rolls or pitches beyond an angle, rad."""
+    for i in range(1, x.shape[0]):
+        if abs(x[i, 6]) > tilt or abs(x[i, 7]) > tilt:
+            return True
+    return False
+
+
+@kernel
+def solve_within_model(
+    A: Array,
+    B: Array,
+    Q: Array,
+    Q_f: Array,
+    stationary: bool,
+    r: Array,
+    has_plan: bool,
+    data: MpcData,
+    s: Scratch,
+    ws: Workspace,
+) -> tuple[int, int]:
+    """`solve_row` with the task's rows; where the plan leaves what its model holds for, with its own, too.
+
+    Most plans never come near: to leave those rows out at first costs them nothing.
+    """
+    H, K = data.own_outputs, data.own_rows
+    level, iterations = solve_row(A, B, Q, Q_f, stationary, r, has_plan, H, K, data, s, ws)
+    if level <= RELAXED and leaves_bound(ws.x, data.plan_bound):
+        H, K = data.normals.shape[0], data.normal.shape[0]
+        again, count = solve_row(A, B, Q, Q_f, stationary, r, has_plan, H, K, data, s, ws)
+        level, iterations = max(level, again), iterations + count
+    return level, iterations
+
+
+@kernel
+def left_model(level: int, x_0: Array, x: Array, points: Array, model_tilt: float, first_angle: int) -> bool:
+    """Whether the state or the plan of a decision is where the model does not hold.
+
+    That is: roll or pitch beyond `model_tilt`, or (stages 1 to N) an Euler angle more than FROZEN_SPAN from
+    the state at which the pair of the stage was taken. Without a plan of its own (PREVIOUS_PLAN, HOVER) a
+    decision has its state alone.
+
+    Args:
+        level: Fallback.
+        x_0: State, (12,).
+        x: Plan, (N+1, 12).
+        points: Where the pairs were taken, (1 or N, 12).
+        model_tilt: rad.
+        first_angle: First of the states that are compared with those points, 6, or 8 for yaw alone.
+    """
+    tilt, span = model_tilt + _ROOM, FROZEN_SPAN + _ROOM
+    if abs(x_0[6]) > tilt or abs(x_0[7]) > tilt:
+        return True
+    if level == PREVIOUS_PLAN or level == HOVER:
+        return False
+    for i in range(1, x.shape[0]):
+        point = points[min(i, points.shape[0] - 1)]
+        for a in range(first_angle, 9):
+            if abs(x[i, a] - point[a]) > span:
+                return True
+    return leaves_tilt(x, tilt)
+
+
+@kernel
+def end_row(
+    level: int,
+    plant: Array,
+    last: Array,
+    revealed: Array,
+    memory: Array,
+    data: MpcData,
+    s: Scratch,
+    u: Array,
+    command: Array,
+    kept: Array,
+) -> None:
+    """The command of one decision, and its memory."""
+    N = u.shape[0]
+    plan, old = kept[1 : 1 + N_INPUT * N], memory[1 : 1 + N_INPUT * N]
+    for i in range(N):
+        for a in range(N_INPUT):
+            k = N_INPUT * i + a
+            if level == PREVIOUS_PLAN:
+                plan[k] = old[min(k + N_INPUT, N_INPUT * (N - 1) + a)]
+            elif level == HOVER:
+                plan[k] = data.coefficients[HOVER_FORCE]
+            else:
+                plan[k] = s.offset[a] + u[i, a]
+        kept[1 + N_INPUT * N + i] = s.working[i]
+    kept[0] = 1.0 if level <= PREVIOUS_PLAN else 0.0
+    limit_command(plan, last, data.rate_step, data.force_max, command)  # also what a backend leaves over
+    if data.gain[0] > 0.0:
+        remember(plant, command, revealed, s.estimate, kept[1 + MEMORY_STAGE * N :])

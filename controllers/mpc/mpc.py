@@ -1,0 +1,423 @@
+"""What all MPCs share in Python: options and their checks, memory, and the batched decision."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quad_envs.checks import require_whole
+from quad_envs.names import shown
+from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, RATES, VELOCITY, Array, Limits
+from quad_envs.tasks import BaseTask, Task
+
+from ..controller import Decision, as_one_row, as_rows, first_non_finite, raise_non_finite, require_horizon
+from ..disturbance import ESTIMATOR_SIZE, N_DISTURBANCE
+from ..fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXED_WEIGHT
+from ..model import hover_pair
+from ..qp import Backend, Status, StructuredSolver
+from ..qp.ocp import IntArray, OcpQp, StateRows, concatenate_rows, no_rows, output_rows
+from ..qp.riccati import dare
+from ..qp.solution import MOST_ITERATIONS
+from ..qp.structured import Workspace, make_workspace
+from .estimator_gain import estimator_gains
+from .kernels import (
+    MEMORY_STAGE,
+    MpcData,
+    Scratch,
+    begin_row,
+    buffer_size,
+    carve,
+    end_row,
+    leaves_bound,
+    left_model,
+    rotor_lag,
+)
+from .weights import change_weight, require_turnable, terminal_weight, weight_matrix
+
+SolverName = Literal["structured", "osqp"]
+Frame = Literal["heading", "hover"]
+VelocityReference = Literal["heading", "attitude"]
+VelocityAxes = Literal["level", "present", "heading", "attitude"]
+PLAN_WEIGHT = 1e4  # per rad, rad/s: of rows that keep a plan in its model; 1e3 gives way to heavy positions
+PLAN_TILT = 0.8  # rad, of models linear in the attitude
+PLAN_TURN = 0.3  # rad, of roll and pitch from sample to sample
+YAW_SHARE = 0.5  # of it for yaw: the axes of the problem stay where the heading is now
+EXACT_TILT = 1.0  # rad, of the exact model
+SOFT_WEIGHT = 25.0  # per SI unit: keeps the corridor's limits; from 30 on, 3 m outside walls, some flip
+
+
+def require_choice(name: str, value: object, kind: Any) -> None:
+    """Check that `value` is one of the strings of a Literal type.
+
+    Raises:
+        ValueError: If it is not; names what is allowed.
+    """
+    if value not in get_args(kind):
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, get_args(kind)))}, got {shown(value)}")
+
+
+@dataclass(frozen=True, slots=True)
+class MpcOptions:
+    """Options that every MPC takes; `LinearMPC` explains them.
+
+    Raises:
+        ValueError: If one is not allowed.
+    """
+
+    solver: SolverName
+    frame: Frame
+    velocity_reference: VelocityAxes
+    soft_weight: float
+    margin: float
+    reject_disturbance: bool
+    estimator_gain: float | Literal["auto"]
+    iteration_limit: int
+    Q: ArrayLike | None = None  # weight of the state: number, diagonal (12,) or matrix; None: the reward's
+    R: ArrayLike | None = None  # weight of the forces: number, diagonal (4,) or matrix; None: the reward's
+    plan_tilt: float = math.inf  # rad, largest roll and pitch of a plan, for the sake of its model
+    plan_rate: float = math.inf  # rad/s, largest roll and pitch rate of a plan, half of it in yaw, likewise
+    terminal: ArrayLike = 1.0  # factor of P, the weight of x_N, or a matrix (12, 12) in the problem's axes
+    R_rate: ArrayLike | None = None  # weight of the changes of the forces, as R; None: none
+
+    def __post_init__(self) -> None:
+        require_choice("solver", self.solver, SolverName)
+        require_choice("frame", self.frame, Frame)
+        if not self.soft_weight >= 0.0:
+            raise ValueError(
+                f"soft_weight must be >= 0 (math.inf for hard rows), got {shown(self.soft_weight)}"
+            )
+        if not 0.0 <= self.margin < math.inf:
+            raise ValueError(
+                f"margin must be a finite number >= 0, in SI units of each limit, got {shown(self.margin)}"
+            )
+        if self.estimator_gain != "auto" and not 0.0 < self.estimator_gain <= 1.0:
+            raise ValueError(
+                f"estimator_gain must be 'auto' or lie in (0, 1], got {shown(self.estimator_gain)}"
+            )
+        if not self.plan_tilt > 0.0:
+            raise ValueError(f"plan_tilt must be > 0 rad, got {shown(self.plan_tilt)}; math.inf is no limit")
+            raise ValueError(f"plan_tilt must be > 0 rad, got {self.plan_tilt!r}; math.inf is no limit")
+        if not self.plan_rate > 0.0:
+            raise ValueError(
+                f"plan_rate must be > 0 rad/s, got {shown(self.plan_rate)}; math.inf is no limit"
+            )
+        require_whole(
+            "iteration_limit (0: one that grows with the problem)", self.iteration_limit, 0, MOST_ITERATIONS
+        )
+
+
+class Problem(NamedTuple):
+    """What a flavour contributes to the OCP-QP of one sample."""
+
+    A: Array  # (1 or N, 12, 12)
+    B: Array  # (1 or N, 12, 4)
+    Q: Array  # (1 or N, 12, 12)
+    Q_f: Array  # (12, 12)
+    stationary: bool
+    r: Array  # (N+1, 12)
+
+
+def limit_rows(limits: Limits, margin: float, weight: float, horizon: int) -> tuple[StateRows, IntArray]:
+    """State rows of the limits, less a margin, at stages 1..N; the position axis of each output (-1: none).
+
+    Outputs: body velocity components, roll and pitch, coordinates of the position, in this order.
+    """
+    lower, upper = np.full(N_STATE, -math.inf), np.full(N_STATE, math.inf)
+    lower[VELOCITY], upper[VELOCITY] = -limits.velocity, limits.velocity
+    lower[ATTITUDE][:2], upper[ATTITUDE][:2] = -limits.tilt, limits.tilt
+    lower[POSITION], upper[POSITION] = limits.position_lower, limits.position_upper
+    order = np.r_[VELOCITY, ATTITUDE, POSITION]
+    outputs = order[np.isfinite(lower[order]) | np.isfinite(upper[order])]
+    lower, upper = lower + margin, upper - margin
+    if (lower > upper).any():
+        raise ValueError(
+            f"margin {margin!r} leaves nothing between the limits of the task; choose a smaller one"
+        )
+    rows = output_rows(np.eye(N_STATE)[outputs], lower[outputs], upper[outputs], weight, horizon)
+    return rows, np.where(outputs < POSITION.stop, outputs, -1).astype(np.int64)
+
+
+def default_tilt(plan_tilt: float | None, usual: float, frame: Frame) -> float:
+    """The tilt that a plan keeps to, rad: as chosen, else the usual one, in the dissertation's frame none."""
+    if plan_tilt is not None:
+        return plan_tilt
+    return usual if frame == "heading" else math.inf
+
+
+def default_rate(plan_rate: float | None, dt: float, frame: Frame) -> float:
+    """The rate that a plan keeps to, rad/s: as chosen, else `PLAN_TURN` a sample; cf. `default_tilt`."""
+    if plan_rate is not None:
+        return plan_rate
+    return PLAN_TURN / dt if frame == "heading" else math.inf
+
+
+def plan_bound(options: MpcOptions, limits: Limits) -> Array:
+    """Largest magnitude of each state of a plan where its model holds, (12,); inf for none of its own."""
+    bound = np.full(N_STATE, math.inf)
+    if options.plan_tilt < limits.tilt:
+        bound[ATTITUDE][:2] = options.plan_tilt
+    bound[RATES] = options.plan_rate * np.array([1.0, 1.0, YAW_SHARE])
+    return bound
+
+
+def plan_rows(bound: Array, horizon: int) -> StateRows:
+    """Rows that keep a plan where its model holds.
+
+    They are soft and stiff: `solve_within_model` takes them in only when a plan needs them.
+    """
+    bounded = np.isfinite(bound)
+    if not bounded.any():
+        return no_rows()
+    return output_rows(np.eye(N_STATE)[bounded], -bound[bounded], bound[bounded], PLAN_WEIGHT, horizon)
+
+
+def estimator_gain(task: BaseTask, options: MpcOptions) -> Array:
+    """Gain of each channel of the disturbance estimator, (6,); zeros without one."""
+    if not options.reject_disturbance:
+        return np.zeros(N_DISTURBANCE)
+    if options.estimator_gain == "auto":
+        return estimator_gains(task)
+    return np.full(N_DISTURBANCE, float(options.estimator_gain))
+
+
+def mpc_data(task: BaseTask, horizon: int, options: MpcOptions) -> MpcData:
+    """The constants of a controller."""
+    params = task.params
+    Q = weight_matrix("Q", task.weights.Q if options.Q is None else options.Q, N_STATE, definite=False)
+    R = weight_matrix("R", task.weights.R if options.R is None else options.R, N_INPUT, definite=True)
+    P = terminal_weight(options.terminal, dare(*hover_pair(params, task.dt), Q, R))
+    if options.frame == "heading":
+        require_turnable(Q)
+    own, axis = limit_rows(task.limits, options.margin, options.soft_weight, horizon)
+    bound = plan_bound(options, task.limits)
+    planned = plan_rows(bound, horizon)
+    rows = concatenate_rows(own, planned)
+    return MpcData(
+        coefficients=params.coefficients(),
+        B_c=params.input_matrix(),
+        Q=np.ascontiguousarray(Q[None]),
+        R=R,
+        R_rate=change_weight(options.R_rate),
+        P=P,
+        normals=rows.normals,
+        axis=np.r_[axis, np.full(len(planned.normals), -1, np.int64)],
+        normal=rows.normal,
+        stage=rows.stage,
+        lower=rows.lower.copy(),  # without rows these are read-only views, another type to numba
+        upper=rows.upper.copy(),
+        weight=rows.weight.copy(),
+        dt=float(task.dt),
+        force_max=task.force_max,
+        rate_step=float(task.limits.rate * task.dt),
+        lag=rotor_lag(task),
+        gain=estimator_gain(task, options),
+        heading=options.frame == "heading",
+        attitude=options.frame == "heading" and options.velocity_reference in ("attitude", "present"),
+        level=options.frame == "heading" and options.velocity_reference == "level",
+        present=options.frame == "heading" and options.velocity_reference == "present",
+        kinematics=False,
+        iteration_limit=int(options.iteration_limit),
+        plan_bound=bound,
+        own_outputs=len(own.normals),
+        own_rows=len(own.normal),
+        model_tilt=PLAN_TILT,
+        first_angle=ATTITUDE.start,
+    )
+
+
+class Mpc(ABC):
+    """A flavour of MPC: makes the pairs of the OCP-QP, and inherits the rest.
+
+    Not for use by several threads at once: the scratch memory is shared.
+    """
+
+    def __init__(self, task: Task, horizon: int, options: MpcOptions, *, pairs: int, guess: bool) -> None:
+        horizon = require_horizon(horizon)
+        self.task = task
+        self.horizon = horizon
+        self.options = options
+        self._data = mpc_data(task, self.horizon, options)
+        self._pairs = pairs
+        self._guess_stages = self.horizon if guess else 0
+        self._keep_from = (
+            1 + MEMORY_STAGE * self.horizon + (ESTIMATOR_SIZE if options.reject_disturbance else 0)
+        )
+        self.memory_size = self._keep_from + (1 + N_STATE * (self.horizon + 1) if guess else 0)
+        self._workspace: tuple[IntArray | None, Array, Workspace] | None = None
+        self._backend: Backend | None = None
+
+    @property
+    def _own_terminal(self) -> bool:
+        """Whether the terminal weight is not the one that makes the Riccati recursion stationary."""
+        return np.ndim(self.options.terminal) > 0 or self.options.terminal != 1.0
+
+    def decide(
+        self,
+        plant: ArrayLike,
+        window: ArrayLike,
+        last_command: ArrayLike,
+        disturbance: ArrayLike,
+        memory: ArrayLike,
+    ) -> Decision:
+        """One command per vehicle; see `Controller.decide`."""
+        arrays = as_rows(plant, window, last_command, disturbance, memory, self.horizon + 1, self.memory_size)
+        n = arrays[0].shape[0]
+        command, kept, report = (
+            np.empty((n, N_INPUT)),
+            np.empty((n, self.memory_size)),
+            np.empty((3, n), np.int64),
+        )
+        if self.options.solver == "structured":
+            bad = self._decide_rows(*arrays, command, kept, report)
+        else:
+            bad = self._decide_by_backend(*arrays, command, kept, report)
+        if bad >= 0:
+            raise_non_finite(bad)
+        return Decision(command, kept, *report)
+
+    def problem(
+        self,
+        plant: ArrayLike,
+        window: ArrayLike,
+        last_command: ArrayLike,
+        disturbance: ArrayLike,
+        memory: ArrayLike,
+    ) -> OcpQp:
+        """The OCP-QP of the first pass of one vehicle's decision, for study; arguments of `decide`, one row.
+
+        It lives in the frame of the problem (`MpcOptions.frame`), and its inputs are u = F - F_trim with
+        F_trim = -lower.
+
+        Raises:
+            ValueError: If a shape is wrong or a number is not finite.
+        """
+        row = as_one_row(plant, window, last_command, disturbance, memory, self.horizon + 1, self.memory_size)
+        which, buffer, ws = self._scratch()
+        s = carve(buffer, self.horizon, *self._sizes())
+        begin_row(*row, which, self._data, s)
+        qp = self._as_qp(self._pose(0, row[-1], s, ws), s, *self._row_sets()[0])
+        rows = StateRows._make(np.array(value) for value in qp.rows)
+        qp = qp._replace(rows=rows)
+        return OcpQp._make(np.array(v) if isinstance(v, np.ndarray) else v for v in qp)
+
+    @abstractmethod
+    def _decide_rows(self, *arrays: Any) -> int:
+        """The whole batch in one compiled call."""
+
+    @abstractmethod
+    def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
+        """The problem of one pass, given the plan of the pass before in ws."""
+
+    def _accept(self, number: int, s: Scratch, ws: Workspace) -> bool:
+        """Take the plan in ws after pass `number`; whether it is the last one."""
+        return True
+
+    def _keep(self, level: int, kept: Array, s: Scratch) -> None:  # noqa: B027  most flavours keep nothing
+        """Write what the flavour remembers."""
+
+    def _scratch(self) -> tuple[IntArray | None, Array, Workspace]:
+        """What `begin_row` takes for the estimator, the flat buffer, the solver's memory; made at need."""
+        if self._workspace is None:
+            self._workspace = (
+                np.zeros(1, np.int64) if self.options.reject_disturbance else None,
+                np.zeros(buffer_size(self.horizon, *self._sizes())),
+                make_workspace(self.horizon, len(self._data.normal), self._pairs, len(self._data.R_rate) > 0),
+            )
+        return self._workspace
+
+    def _sizes(self) -> tuple[int, int, int, int]:
+        """Pairs, outputs, rows, stages of the guess."""
+        return self._pairs, len(self._data.normals), len(self._data.normal), self._guess_stages
+
+    def _decide_by_backend(self, *arrays: Any) -> int:
+        """The same kernels row by row, with a solver behind the common interface."""
+        plants, windows, lasts, disturbances, memories, commands, kept, report = arrays
+        bad = first_non_finite(plants, windows, lasts, disturbances, memories, self.horizon + 1)
+        if bad >= 0:
+            return bad
+        which, buffer, ws = self._scratch()
+        s = carve(buffer, self.horizon, *self._sizes())
+        for j in range(len(plants)):
+            row = plants[j], windows[j], lasts[j], disturbances[j], memories[j]
+            begin_row(*row, which, self._data, s)
+            level, iterations, number, done = NONE, 0, 0, False
+            while not done:
+                problem = self._pose(number, memories[j], s, ws)
+                level, count = self._solve(problem, bool(memories[j, 0] > 0.0), level, s, ws)
+                iterations += count
+                done = level > RELAXED or self._accept(number, s, ws)
+                number += 1
+            end_row(
+                level,
+                plants[j],
+                lasts[j],
+                disturbances[j],
+                memories[j],
+                self._data,
+                s,
+                ws.u,
+                commands[j],
+                kept[j],
+            )
+            self._keep(level, kept[j], s)
+            points = s.points[: len(problem.A)]
+            tilt, first = self._data.model_tilt, self._data.first_angle
+            report[:, j] = level, iterations, left_model(level, s.x_0, ws.x, points, tilt, first)
+        return -1
+
+    def _solve(
+        self, problem: Problem, has_plan: bool, level: int, s: Scratch, ws: Workspace
+    ) -> tuple[int, int]:
+        """The fallback order of `solve_row` with any backend."""
+        if self._backend is None:
+            from ..qp.osqp import OsqpSolver
+
+            self._backend = OsqpSolver(persistent=False)  # rows must not depend on each other
+        iterations = 0
+        for which in self._row_sets():
+            qp = self._as_qp(problem, s, *which)
+            solution = self._backend.solve(qp)
+            iterations += solution.iterations
+            if solution.status == Status.INFEASIBLE and level == NONE:
+                np.minimum(s.weight, RELAXED_WEIGHT, out=s.weight)
+                level = RELAXED
+                solution = self._backend.solve(qp)
+                iterations += solution.iterations
+            if solution.status != Status.OPTIMAL or not leaves_bound(solution.x, self._data.plan_bound):
+                break
+        if solution.status != Status.OPTIMAL and has_plan:
+            return PREVIOUS_PLAN, iterations
+        if solution.status != Status.OPTIMAL:
+            level = CLIPPED_SDRE
+            s.lower[:], s.upper[:] = -math.inf, math.inf
+            solution = StructuredSolver().solve(qp._replace(rate_step=math.inf, rows=no_rows()))
+        if solution.status != Status.OPTIMAL:
+            return HOVER, iterations
+        ws.u[:], ws.x[:] = solution.u, solution.x
+        return level, iterations
+
+    def _row_sets(self) -> tuple[tuple[int, int], ...]:
+        """Outputs and rows of the task's limits, then with those of the plan's own where it has some."""
+        own = self._data.own_outputs, self._data.own_rows
+        every = len(self._data.normals), len(self._data.normal)
+        return (own,) if own == every else (own, every)
+
+    def _as_qp(self, problem: Problem, s: Scratch, H: int, K: int) -> OcpQp:
+        """The problem of one pass as data, with H outputs and K rows; views of the scratch memory."""
+        data = self._data
+        rows = StateRows(
+            s.normals[:H], data.normal[:K], data.stage[:K], s.row_lower[:K], s.row_upper[:K], s.weight[:K]
+        )
+        return OcpQp(
+            *problem[:2], s.c, problem.Q, self._data.R, *problem[3:5], s.x_0, problem.r, s.lower, s.upper,
+            self._data.rate_step, s.u_last, rows, data.R_rate if len(data.R_rate) else None,
+        )  # fmt: skip
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but scratch memory and the backend's, which are made again when needed."""
+        return {**self.__dict__, "_workspace": None, "_backend": None}

@@ -1,0 +1,334 @@
+"""SDC-NMPC: MPC on the state-dependent-coefficient model of chapter 4, Eqs. (4.8) to (4.11)."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quad_envs._numba import kernel
+from quad_envs.checks import require_whole
+from quad_envs.names import shown
+from quad_envs.parameters import N_STATE, Array
+from quad_envs.tasks import Task
+
+from ..controller import MOST_PASSES, first_non_finite
+from ..fallback import RELAXED
+from ..model import sdc_matrix, zero_order_hold
+from ..qp.linalg import copy
+from ..qp.ocp import IntArray
+from ..qp.riccati import solve_dare
+from ..qp.structured import ITERATION_LIMIT, Workspace
+from .kernels import (
+    FROZEN_SPAN,
+    MpcData,
+    Scratch,
+    begin_row,
+    carve,
+    copy_vector,
+    end_row,
+    hold_trim,
+    left_model,
+    solve_within_model,
+)
+from .mpc import (
+    PLAN_TILT,
+    SOFT_WEIGHT,
+    Frame,
+    Mpc,
+    MpcOptions,
+    Problem,
+    SolverName,
+    default_rate,
+    default_tilt,
+    require_choice,
+)
+from .present_axes import pair_in_present_axes, stop_turning
+
+TerminalWeight = Literal["hover", "sdre"]
+PresentReference = Literal["present", "heading", "attitude"]
+_TILT_LIMIT = 1.4  # rad, of roll and pitch of the states at which the model is taken again
+
+
+@kernel
+def hold_heading(r: Array, x: Array, A_c: Array, dt: float, c: Array) -> None:
+    """Add to c (12,) what keeps V_B from turning with the heading of the reference: Omega_ref x V_B.
+
+    The model turns V_B with the predicted rates, but moves the position by the V_B of the present axes, in
+    which v_ref stands, too: a vehicle that flies straight while its heading turns would seem to fly a curve.
+    Counting the planned turn out leaves V_B in axes that do not turn. Exact for alpha = 1.
+
+    Args:
+        r: Reference of the stage, (12,), with Omega_ref.
+        x: State at which the model was taken, (12,).
+        A_c: That model, (12, 12).
+        dt: Control period, s.
+        c: Affine term, (12,), changed in place.
+    """
+    p, q, w = r[9], r[10], r[11]
+    if p == 0.0 and q == 0.0 and w == 0.0:
+        return
+    g0, g1, g2 = q * x[5] - w * x[4], w * x[3] - p * x[5], p * x[4] - q * x[3]
+    c[3], c[4], c[5] = c[3] + dt * g0, c[4] + dt * g1, c[5] + dt * g2
+    for a in range(3):
+        c[a] += 0.5 * dt * dt * (A_c[a, 3] * g0 + A_c[a, 4] * g1 + A_c[a, 5] * g2)
+
+
+@kernel
+def freeze_model(alpha: float, present: bool, sdre_weight: bool, data: MpcData, s: Scratch) -> bool:
+    """The pair at x_0 for the whole horizon, and the terminal weight.
+
+    Returns:
+        Whether the terminal weight solves the Riccati equation of the pair.
+    """
+    sdc_matrix(s.x_0, alpha, data.coefficients, s.A_c)
+    if present:
+        stop_turning(s.A_c)
+    zero_order_hold(s.A_c, data.B_c, data.dt, s.A[0], s.B[0], s.square)
+    copy_vector(s.x_0, s.points[0])
+    hold_trim(s.A[:1], s.trim, s.c)
+    for i in range(0 if present else s.c.shape[0]):
+        hold_heading(s.r[i], s.x_0, s.A_c, data.dt, s.c[i])
+    if sdre_weight and solve_dare(s.A[0], s.B[0], data.Q[0], data.R, s.P, s.square) > 0:
+        return True
+    copy(data.P, s.P)
+    return False
+
+
+@kernel
+def relinearise(u: Array, alpha: float, present: bool, data: MpcData, s: Scratch) -> None:
+    """The N pairs met along x_{i+1} = A(x_i) x_i + B(x_i) u_i + c_i under the plan u; memoryless."""
+    x, x_next = s.square[3, 0], s.square[3, 1]
+    R, work = s.square[8, :3], s.square[8, 3:9]
+    B_c = s.square[9].reshape(-1)[: data.B_c.size].reshape(data.B_c.shape)
+    copy(data.B_c, B_c)
+    sdc_matrix(s.x_0, alpha, data.coefficients, s.A_c)
+    for a in range(3):
+        copy_vector(s.A_c[a, 3:6], R[a, :3])
+    copy_vector(s.x_0, x)
+    for i in range(u.shape[0]):
+        copy_vector(x, s.points[i])
+        yaw = x[8]
+        if not present:
+            x[8] -= s.r[i, 8] - s.r[0, 8]  # velocities do not turn with the heading of the reference
+        sdc_matrix(x, alpha, data.coefficients, s.A_c)
+        if present:
+            pair_in_present_axes(R, data.B_c, s.A_c, B_c, work)
+        x[8] = yaw
+        zero_order_hold(s.A_c, B_c, data.dt, s.A[i], s.B[i], s.square)
+        hold_trim(s.A[i : i + 1], s.trim, s.c[i : i + 1])
+        if not present:
+            hold_heading(s.r[i], x, s.A_c, data.dt, s.c[i])
+        for a in range(N_STATE):
+            total = s.c[i, a]
+            for b in range(N_STATE):
+                total += s.A[i, a, b] * x[b]
+            for b in range(u.shape[1]):
+                total += s.B[i, a, b] * u[i, b]
+            x_next[a] = total
+        copy_vector(x_next, x)
+        x[6] = min(max(x[6], -_TILT_LIMIT), _TILT_LIMIT)
+        x[7] = min(max(x[7], -_TILT_LIMIT), _TILT_LIMIT)
+
+
+@kernel
+def leaves_pair(x: Array) -> bool:
+    """Whether a plan (N+1, 12) rolls, pitches or yaws so far that the pair at its start no longer holds."""
+    for i in range(1, x.shape[0]):
+        for a in range(6, 9):
+            if abs(x[i, a] - x[0, a]) > FROZEN_SPAN:
+                return True
+    return False
+
+
+@kernel
+def _decide_rows(
+    plants: Array,
+    windows: Array,
+    lasts: Array,
+    disturbances: Array,
+    memories: Array,
+    commands: Array,
+    kept: Array,
+    report: IntArray,
+    which: IntArray | None,
+    alpha: float,
+    present: bool,
+    relinearisations: int,
+    at_need: bool,
+    sdre_weight: bool,
+    data: MpcData,
+    buffer: Array,
+    ws: Workspace,
+) -> int:
+    """One decision per row; -1, or the code of the first argument that is not finite."""
+    N = ws.u.shape[0]
+    bad = first_non_finite(plants, windows, lasts, disturbances, memories, N + 1)
+    if bad >= 0:
+        return bad
+    pairs = N if relinearisations > 0 else 1
+    H, K = data.normals.shape[0], data.normal.shape[0]
+    s = carve(buffer, N, pairs, H, K, 0)
+    for j in range(plants.shape[0]):
+        begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
+        worst, iterations = 0, 0
+        stationary = freeze_model(alpha, present, sdre_weight, data, s)
+        for k in range(1 + relinearisations):
+            pairs = 1
+            if k > 0:
+                relinearise(ws.u, alpha, present, data, s)
+                stationary, pairs = False, N
+            has_plan = memories[j, 0] > 0.0
+            level, count = solve_within_model(
+                s.A[:pairs], s.B[:pairs], data.Q, s.P, stationary, s.r, has_plan, data, s, ws
+            )
+            worst, iterations = max(worst, level), iterations + count
+            if level > RELAXED or (at_need and not leaves_pair(ws.x)):
+                break
+        end_row(worst, plants[j], lasts[j], disturbances[j], memories[j], data, s, ws.u, commands[j], kept[j])
+        left = left_model(worst, s.x_0, ws.x, s.points[:pairs], data.model_tilt, data.first_angle)
+        report[0, j], report[1, j], report[2, j] = worst, iterations, left
+    return bad
+
+
+class SdcNmpc(Mpc):
+    """MPC on x' = A_c(x) x + B_c u, exact for the present state and frozen over the horizon.
+
+    Deviation:
+        alpha = 1 by default; 1/2 is the dissertation's factorisation (4.6), under which the present body
+        rates stay frozen in the prediction and go on turning V_B: it loses a climbing helix. Frames as in
+        `LinearMPC`.
+
+    Args:
+        task: What is known of the flight.
+        horizon: N, samples.
+        alpha: Member of the family of factorisations, in [0, 1]; see `model.sdc_matrix`.
+        relinearisations: Further passes, each with the pairs along the plan of the pass before. "auto" makes
+            one where the plan turns by more than FROZEN_SPAN, none in frame "hover"; 0 is the dissertation's.
+        terminal_weight: "hover": P of the hover model; "sdre": P of the present pair.
+        solver: See `LinearMPC`, as the options that follow.
+        frame: "heading" or "hover".
+        velocity_reference: What is compared with v_ref, in frame "heading". "present": the velocity in axes
+            of the present attitude (`present_axes.py`), into which v_ref is turned. "heading", "attitude":
+            V_B, which turns along the plan, with v_ref turned by the present heading, or by the whole present
+            attitude. None: "present", or with another alpha than 1 "heading".
+        soft_weight: Exact penalty per unit of a state row; inf makes the rows hard.
+        margin: What the plan keeps from each state limit, in its SI unit: cover for the unmodelled rotor lag.
+        reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
+        estimator_gain: Share of each new residual in the estimate, in (0, 1]; "auto" takes it from
+            `task.sensor_noise`, 0.5 without any.
+        iteration_limit: Largest number of active-set steps of a solve; 0 for one that grows with it.
+        Q: Weight of the state, a number, the diagonal (12,) or a matrix; the reward's by default.
+        R: Weight of the rotor forces, a number, the diagonal (4,) or a matrix; the reward's by default.
+        plan_tilt: Largest roll and pitch of a plan, rad, besides the task's limit: where the model holds.
+            None stands for 0.8 in frame "heading" and no such limit in frame "hover".
+        plan_rate: Largest roll and pitch rate of a plan, rad/s, half of it in yaw, likewise; by default
+            0.3 rad a sample.
+        terminal: Factor of P, the weight of x_N, or a matrix (12, 12) in its place.
+        R_rate: Weight of the changes of the forces from sample to sample, the first one against the command
+            applied before; a number, the diagonal (4,) or a matrix. None: changes cost nothing.
+
+    Raises:
+        ValueError: If an option is not allowed.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        horizon: int = 25,
+        alpha: float = 1.0,
+        relinearisations: int | Literal["auto"] = "auto",
+        terminal_weight: TerminalWeight = "hover",
+        *,
+        solver: SolverName = "structured",
+        frame: Frame = "heading",
+        velocity_reference: PresentReference | None = None,
+        soft_weight: float = SOFT_WEIGHT,
+        margin: float = 0.02,
+        reject_disturbance: bool = False,
+        estimator_gain: float | Literal["auto"] = "auto",
+        iteration_limit: int = ITERATION_LIMIT,
+        Q: ArrayLike | None = None,
+        R: ArrayLike | None = None,
+        plan_tilt: float | None = None,
+        plan_rate: float | None = None,
+        terminal: ArrayLike = 1.0,
+        R_rate: ArrayLike | None = None,
+    ) -> None:
+        if not 0.0 <= alpha <= 1.0:
+            raise ValueError(
+                f"alpha must lie in [0, 1], got {shown(alpha)}; 1/2 is the dissertation's, 1 recommended"
+            )
+        if isinstance(relinearisations, str) and relinearisations == "auto":
+            passes = 1 if frame == "heading" else 0
+        else:
+            require_whole("relinearisations, if not 'auto',", relinearisations, 0, MOST_PASSES)
+            passes = int(relinearisations)
+        if velocity_reference is None:
+            velocity_reference = "present" if frame == "heading" and alpha == 1.0 else "heading"
+        require_choice("velocity_reference", velocity_reference, PresentReference)
+        if velocity_reference == "present" and alpha != 1.0:
+            raise ValueError(
+                f"velocity_reference='present' leaves out -Omega x V_B, which alpha = {alpha!r} splits: "
+                "take alpha=1, or 'heading' or 'attitude'"
+            )
+        require_choice("terminal_weight", terminal_weight, TerminalWeight)
+        options = MpcOptions(
+            solver,
+            frame,
+            velocity_reference,
+            soft_weight,
+            margin,
+            reject_disturbance,
+            estimator_gain,
+            iteration_limit,
+            Q,
+            R,
+            default_tilt(plan_tilt, PLAN_TILT, frame),
+            default_rate(plan_rate, task.dt, frame),
+            terminal,
+            R_rate,
+        )
+        if terminal_weight == "sdre" and (np.ndim(terminal) > 0 or terminal != 1.0):
+            raise ValueError(
+                "terminal changes P of the hover model; terminal_weight='sdre' has another P at each sample: "
+                "leave terminal out, or choose terminal_weight='hover'"
+            )
+        super().__init__(task, horizon, options, pairs=horizon if passes else 1, guess=False)
+        self._data = self._data._replace(kinematics=True)
+        self.alpha = float(alpha)
+        self._present = self._data.present
+        self.relinearisations, self._at_need = passes, relinearisations == "auto"
+        self.terminal_weight = terminal_weight
+
+    def _decide_rows(self, *arrays: Any) -> int:
+        which, buffer, ws = self._scratch()
+        sdre_weight = self.terminal_weight == "sdre"
+        constants = (
+            which,
+            self.alpha,
+            self._present,
+            self.relinearisations,
+            self._at_need,
+            sdre_weight,
+            self._data,
+            buffer,
+            ws,
+        )
+        arguments: tuple[Any, ...] = (*arrays, *constants)
+        return _decide_rows(*arguments)
+
+    def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
+        stationary, pairs = False, 1
+        if number == 0:
+            stationary = freeze_model(
+                self.alpha, self._present, self.terminal_weight == "sdre", self._data, s
+            )
+        else:
+            relinearise(ws.u, self.alpha, self._present, self._data, s)
+            pairs = self.horizon
+        return Problem(s.A[:pairs], s.B[:pairs], self._data.Q, s.P, stationary, s.r)
+
+    def _accept(self, number: int, s: Scratch, ws: Workspace) -> bool:
+        return number == self.relinearisations or (self._at_need and not leaves_pair(ws.x))

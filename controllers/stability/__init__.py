@@ -1,0 +1,1 @@
+"""What of the stability theory can be computed: certificates and invariant sets."""

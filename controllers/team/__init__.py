@@ -1,0 +1,1 @@
+"""Control of teams: consensus, collision avoidance, cooperative and central MPC."""

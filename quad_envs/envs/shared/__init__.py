@@ -1,0 +1,1 @@
+"""What the environments of one vehicle and of teams share."""

@@ -1,0 +1,89 @@
+"""What is drawn or tabulated at reset, for one vehicle or many: references, disturbances, the vehicle itself.
+
+Everything that comes from a user's object is checked here, so that the compiled step reads only good rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ...disturbances import Disturbance
+from ...names import shown
+from ...observations.tracking import N_REFERENCE
+from ...parameters import Array
+from ...references import Reference, too_fast
+from ...tasks import BaseTask
+from ...turning import with_turn_rates
+from .vehicle_options import varied_params
+
+
+def reference_rows(reference: Reference, times: Array, rng: np.random.Generator) -> Array:
+    """Reference rows at the control samples (n,) >= 2, with the rate of the heading, (n, 9).
+
+    Raises:
+        ValueError: If the reference gives another shape or a number that is not finite, or is too fast.
+    """
+    rows = checked_rows("reference", reference, reference.rows(times, rng), times, N_REFERENCE)
+    said = too_fast(rows[:, 3:6], times)
+    if said:
+        raise ValueError(f"reference {shown(reference)} {said}")
+    return with_turn_rates(rows, float(times[1] - times[0]))
+
+
+def checked_rows(kind: str, source: object, rows: Any, times: Array, width: int) -> Array:
+    """Rows that a user's object gave for times (n,), as a float64 array (n, width).
+
+    Raises:
+        ValueError: If the shape is another or a number is not finite.
+    """
+    found = np.asarray(rows, dtype=np.float64)
+    if found.shape != (times.size, width):
+        raise ValueError(
+            f"{kind} {shown(source)} must give rows of shape {(times.size, width)}, got {found.shape}"
+        )
+    if not np.isfinite(found).all():
+        k = int(np.argmin(np.isfinite(found).all(axis=1)))
+        raise ValueError(f"{kind} {shown(source)} is not finite at t = {times[k]:g} s")
+    return found
+
+
+def disturbance_rows(disturbance: Disturbance, nodes: Array, dt: float, rng: np.random.Generator) -> Array:
+    """Disturbances at the stage times nodes (n_steps, n_nodes), (n_steps, n_nodes, 6).
+
+    Raises:
+        ValueError: If the disturbance gives another shape or a number that is not finite.
+    """
+    rows = np.asarray(disturbance.values(nodes, rng), dtype=np.float64)
+    if rows.shape != (*nodes.shape, 6):
+        raise ValueError(
+            f"disturbance {shown(disturbance)} must give values of shape {(*nodes.shape, 6)}, "
+            f"got {rows.shape}"
+        )
+    if not np.isfinite(rows).all():
+        k = int(np.argmin(np.isfinite(rows).all(axis=(1, 2))))
+        raise ValueError(f"disturbance {shown(disturbance)} is not finite at t = {k * dt:g} s")
+    return rows
+
+
+def stage_times(task: BaseTask, substeps: int) -> Array:
+    """Times of the integrator's stages in each control period, (episode_steps, 2 substeps + 1), s."""
+    periods = np.arange(task.episode_steps, dtype=np.float64)[:, None]
+    return np.asarray(task.dt * (periods + np.linspace(0.0, 1.0, 2 * substeps + 1)))
+
+
+def draw_vehicle(
+    task: BaseTask, randomization: Mapping[str, float], rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Coefficients and rotor saturation (4,) of a true vehicle; without randomization nothing is drawn."""
+    params, force_max = task.params, task.force_max
+    if randomization:
+        factors = {
+            name: 1.0 + spread * rng.uniform(-1.0, 1.0, 3 if name == "inertia" else None)
+            for name, spread in randomization.items()
+        }
+        force_max *= float(factors.get("kappa", 1.0))
+        params = varied_params(params, factors)
+    return params.coefficients(), force_max

@@ -1,0 +1,1 @@
+"""Several vehicles at once: formation, target tracking, cooperative estimation."""

@@ -1,0 +1,303 @@
+"""A batch of teams: the arrays that the kernel works on, and the reset of one of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..._numba import entry_of
+from ...checks import array_bytes, require_memory
+from ...constraints import constraint_scales
+from ...dynamics import LANES
+from ...formations import start_positions
+from ...graphs import in_neighbours
+from ...names import nearest_name, shown, unknown_name
+from ...observations.tracking import N_REFERENCE
+from ...parameters import N_STATE, Array
+from ...references import make_reference, pack_rows
+from ...sensors import sensor_rows
+from ...targets import N_TARGET, make_target
+from ...turning import N_TABLE
+from ..shared.given import given_plants
+from ..shared.tables import checked_rows, disturbance_rows, draw_vehicle, reference_rows, stage_times
+from ..tracking.kernel import COEFFICIENTS, COMMAND, FORCE_MAX, PLANT, task_vector
+from .exchange import DISTURBANCE, DRAW, HEAD, MEASURES, NOISE, PLAN, REFERENCE, TARGET, TEAM_ROW_SIZE
+from .kernel import begin_team, scratch_size, step_teams
+from .options import EstimationOptions, FormationOptions, TargetTrackingOptions, TeamOptions
+
+_step = entry_of(step_teams)
+_RESET_OPTIONS = ("state",)
+
+
+class TeamBatch:
+    """`teams` independent flights of one multi-agent task; vehicle i of team t is row t N + i.
+
+    The public arrays are views for reading; `reset_team` and `step` change them.
+    """
+
+    def __init__(self, options: TeamOptions, teams: int) -> None:
+        self.options, self.teams, self.task = options, teams, options.task
+        self.n = options.vehicles
+        self.slots, self.graphs = np.array(self.task.slots), options.graphs
+        layout = self.task.layout
+        content = PLAN + 6 * layout.plan
+        shapes = (
+            (teams * self.n, TEAM_ROW_SIZE),
+            (teams * self.n, layout.neighbours, HEAD + content),
+            (teams, options.delay + 1, self.n, content),
+        )
+        self._take_choices()
+        self._require_memory(*shapes)
+        self.rows, self._messages, self._history = map(np.zeros, shapes)
+        self._vector = task_vector(self.task, options.substeps, math.inf)
+        self._team = _team_vector(options)
+        self.neighbours = np.full((self.n, layout.neighbours), -1, dtype=np.int64)
+        found = in_neighbours(self.graphs.graphs)
+        self.neighbours[:, : found.shape[1]] = found
+        self._make_tables()
+        scratch = np.zeros(scratch_size(self.n, layout.sensed))
+        tables = (self._weights(), self.neighbours, self.graphs.which, self._offsets(), self._which)
+        drawn = (self.references, self.disturbances, self.noises, self.targets, self._draws)
+        self._state = (self.rows, self._messages, self._history, *tables, *drawn)
+        self._begin = (self._vector, self._team, scratch)
+        self._after = (*self._begin, np.zeros(max(self.n, LANES), dtype=np.int64))
+        if isinstance(options, TargetTrackingOptions):
+            for t in range(teams):
+                self.rows[[t * self.n + i for i in options.informed()], MEASURES] = 1.0
+
+    def _take_choices(self) -> None:
+        """What is flown, and which of it is drawn at reset."""
+        options = self.options
+        self._randomization = options.randomization()
+        self._noise = np.repeat(np.asarray(self.task.sensor_noise), 3)
+        self._reference = make_reference(
+            options.reference if isinstance(options, FormationOptions) else "setpoint"
+        )
+        self._disturbance = options.make_disturbance()
+        self._target = make_target(options.target) if isinstance(options, TargetTrackingOptions) else None
+        self._spread = options.target_spread if isinstance(options, TargetTrackingOptions) else (0.0, 0.0)
+        noisy = bool(self._noise.any())
+        self._random = (
+            self._reference.random,
+            self._disturbance is not None and self._disturbance.random,
+            noisy,
+            self._target is not None and (self._target.random or max(self._spread) > 0.0),
+            self._target is not None or options.drop_out > 0.0,
+        )
+
+    def _table_shapes(self) -> list[tuple[int, ...]]:
+        """Shapes of references, disturbances, noises, targets, draws; what never changes is stored once."""
+        n, teams, steps = self.n, self.teams, self.task.episode_steps
+        units = (teams, teams * n, teams * n, teams, teams)
+        count = [unit if random else 1 for unit, random in zip(units, self._random, strict=True)]
+        return [
+            (count[REFERENCE], steps + 1 + self.task.layout.preview, N_TABLE),
+            (count[DISTURBANCE], steps if self._disturbance else 0, 2 * self.options.substeps + 1, 6),
+            (count[NOISE], steps + 1 if self._random[NOISE] else 0, N_STATE),
+            (count[TARGET], steps + 1 if self._target else 0, N_TARGET),
+            (count[DRAW], steps + 1 if self._random[DRAW] else 0, n, 4 + self.task.layout.neighbours),
+        ]
+
+    def _require_memory(self, *shapes: tuple[int, ...]) -> None:
+        """Refuse what this machine cannot hold, before it is taken."""
+        seen = (self.teams * self.n, self.task.layout.size)
+        require_memory(
+            f"{shown(self.teams)} teams of {self.n} vehicles, {self.task.episode_steps} steps",
+            array_bytes(*shapes, seen, *self._table_shapes()),
+            "choose fewer of them, shorter ones, a shorter preview or delay, or fewer neighbours",
+        )
+
+    def _make_tables(self) -> None:
+        """Tables of what is drawn at reset."""
+        options, n, teams, never = self.options, self.n, self.teams, np.random.default_rng(0)
+        steps, dt = self.task.episode_steps, self.task.dt
+        self._times = dt * np.arange(steps + 1 + self.task.layout.preview, dtype=np.float64)
+        self._nodes = stage_times(self.task, options.substeps)
+        tables = [np.zeros(shape) for shape in self._table_shapes()]
+        self.references, self.disturbances, self.noises, self.targets, self._draws = tables
+        self._which = np.zeros((5, teams * n), dtype=np.int64)
+        for kind in range(5):
+            if self._random[kind]:
+                each = 1 if kind in (DISTURBANCE, NOISE) else n
+                self._which[kind] = np.arange(teams * n) // each
+        first = reference_rows(self._reference, self._times, never)  # of a random one, to see that it works
+        if not self._random[REFERENCE]:
+            self.references[0] = first
+        if self._disturbance is not None and not self._random[DISTURBANCE]:
+            self.disturbances[0] = disturbance_rows(self._disturbance, self._nodes, dt, never)
+        if self._target is not None and not self._random[TARGET]:
+            self.targets[0] = self._target_rows(never)
+
+    def _weights(self) -> Array:
+        """G_ij per graph and slot, (M, N, K)."""
+        i = np.arange(self.n)[:, None]
+        return np.where(self.neighbours >= 0, self.graphs.graphs[:, i, self.neighbours], 0.0)
+
+    def _offsets(self) -> Array:
+        """delta_ij per slot, then the own slot, (N, K + 1, 3)."""
+        K = self.neighbours.shape[1]
+        out = np.zeros((self.n, K + 1, 3))
+        offsets = self.slots[:, None] - self.slots[self.neighbours]
+        out[:, :K] = np.where(self.neighbours[..., None] >= 0, offsets, 0.0)
+        out[:, K] = self.slots
+        return out
+
+    def reset_team(
+        self,
+        t: int,
+        rng: np.random.Generator,
+        out: NDArray[np.float32],
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Begin a new episode of team t and write its first observations.
+
+        Draws, in this order: starts, vehicles, reference, disturbances, target, own sensors' noise,
+        measurement noise, detections and drop-outs.
+
+        Args:
+            t: Team.
+            rng: The generator of this team.
+            out: Observations, (N, layout.size) float32.
+            options: `{"state": ...}` puts the plants (N, 12) or (N, 16) there.
+
+        Raises:
+            ValueError: If the state does not fit, or two vehicles start nearer than the crash distance.
+        """
+        first, n = t * self.n, self.n
+        given = _given_state(options, n, self.task.hover_force)
+        plants = self._start(rng) if given is None else given
+        self.options.require_apart(plants[:, :3])
+        for i in range(n):
+            row = self.rows[first + i]
+            measures = row[MEASURES]
+            row[:] = 0.0
+            row[PLANT], row[MEASURES] = plants[i], measures
+            row[COMMAND] = self.task.hover_force
+            row[COEFFICIENTS], row[FORCE_MAX] = draw_vehicle(self.task, self._randomization, rng)
+        if self._random[REFERENCE]:
+            self.references[t] = reference_rows(self._reference, self._times, rng)
+        if self._disturbance is not None and self._random[DISTURBANCE]:
+            for i in range(first, first + n):
+                self.disturbances[i] = disturbance_rows(self._disturbance, self._nodes, self.task.dt, rng)
+        if self._random[TARGET]:
+            self.targets[t] = self._target_rows(rng)
+        if self._random[NOISE]:
+            noises = self.noises[first : first + n]
+            rng.standard_normal(out=noises)
+            noises *= self._noise
+        if self._random[DRAW]:
+            draws = self._draws[t]
+            draws[..., :3] = rng.standard_normal((*draws.shape[:-1], 3))
+            draws[..., 3:] = rng.random((*draws.shape[:-1], draws.shape[-1] - 3))
+        begin_team(first, *self._state, *self._begin, out)
+
+    def target(self, t: int) -> Array:
+        """Rows r, v of the target of team t, a view, (T+1, 6); zero where there is none."""
+        if self._target is None:
+            return np.broadcast_to(0.0, (self.task.episode_steps + 1, N_TARGET))
+        return np.asarray(self.targets[self._which[TARGET, t * self.n]])
+
+    def wanted(self, t: int) -> Array:
+        """Where each vehicle of team t should be, rows as in a reference, (N, T+1, 8)."""
+        steps = self.task.episode_steps + 1
+        if self._target is None:
+            rows = self.references[self._which[REFERENCE, t * self.n], :steps, :N_REFERENCE]
+        else:
+            rows = pack_rows(*np.split(self.target(t), 2, axis=1))
+        out = np.repeat(rows[None], self.n, axis=0)
+        out[..., :3] += self.slots[:, None]
+        return out
+
+    def graph(self, k: int) -> Array:
+        """Weights G at step k, (N, N)."""
+        return np.asarray(self.graphs.graphs[self.graphs.which[k]])
+
+    def heard(self, t: int) -> Array:
+        """Weight, sent, received of the last message in each comm slot of team t, a view, (N, K, 3)."""
+        return self._messages[t * self.n : (t + 1) * self.n, :, :HEAD]
+
+    def step(self, actions: NDArray[np.floating], out: NDArray[np.float32]) -> None:
+        """Move all teams by one control period and write their observations.
+
+        Args:
+            actions: (teams N, action_size), contiguous; clipped to [-1, 1], which is counted.
+            out: (teams N, layout.size) float32.
+
+        Raises:
+            ValueError: If an action is not finite; then nobody has moved.
+        """
+        bad = _step(*self._state, actions.reshape(-1), *self._after, out.reshape(-1))
+        if bad >= 0:
+            row, entry = divmod(bad, self.task.action_size)
+            raise ValueError(
+                f"action[{entry}] of vehicle {row % self.n} (team {row // self.n}) is "
+                f"{actions.reshape(-1)[bad]}; actions must be finite numbers in [-1, 1]. Nobody has moved."
+            )
+
+    def _start(self, rng: np.random.Generator) -> Array:
+        """First plants, (N, 16): at rest, or on their rails."""
+        plants = np.zeros((self.n, N_STATE + 4))
+        plants[:, N_STATE:] = self.task.hover_force
+        if isinstance(self.options, EstimationOptions):
+            plants[:, :3] = self.options.rail_positions()
+            plants[:, 3:6] = self.options.rail_velocity
+        else:
+            plants[:, :3] = start_positions(self.options.start, self.slots, rng, self.task.separation)
+        return plants
+
+    def _target_rows(self, rng: np.random.Generator) -> Array:
+        """Rows r, v of the target, displaced by what is not known of its start."""
+        assert self._target is not None
+        times = self._times[: self.task.episode_steps + 1]
+        rows = checked_rows("target", self._target, self._target.rows(times, rng), times, N_TARGET)
+        if max(self._spread) > 0.0:
+            offset = np.repeat(np.asarray(self._spread), 3) * rng.standard_normal(N_TARGET)
+            rows = rows + offset
+            rows[:, :3] += times[:, None] * offset[3:]
+        return rows
+
+
+def _team_vector(options: TeamOptions) -> Array:
+    """The team's part of the task in the form that the kernels read, see `exchange`."""
+    task = options.task
+    scales = np.ones(5)
+    named = constraint_scales(task.limits, task.dt)
+    scales[: named.size] = named
+    scales[named.size] = task.separation - task.crash_distance
+    targets = isinstance(options, TargetTrackingOptions)
+    return np.array(
+        [
+            task.separation,
+            task.crash_distance,
+            task.sensing_radius,
+            round(options.message_lifetime / task.dt + 1e-9),
+            options.drop_out,
+            task.formation_weight,
+            options.arena,
+            options.terminate == "team",
+            options.has_leader,
+            isinstance(options, EstimationOptions),
+            sensor_rows(task.sensor) if targets else 0,
+            options.detection if isinstance(options, TargetTrackingOptions) else 0.0,
+            task.layout.plan,
+            len(task.constraint_names),
+            task.layout.sensed,
+            *task.sensor_sigma,
+            *scales,
+        ],
+        dtype=np.float64,
+    )
+
+
+def _given_state(options: Mapping[str, Any] | None, n: int, hover: float) -> Array | None:
+    """Plants (N, 16) from the reset options. Foreign options pass, as PettingZoo's tests demand."""
+    for name in options or {}:
+        if name not in _RESET_OPTIONS and nearest_name(name, _RESET_OPTIONS) is not None:
+            raise ValueError(unknown_name("reset option", name, _RESET_OPTIONS))
+    if not options or "state" not in options:
+        return None
+    return given_plants(options["state"], (n,), hover)

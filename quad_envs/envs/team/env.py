@@ -1,0 +1,279 @@
+"""What the multi-agent environments share: one team behind PettingZoo's parallel API."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import logger, spaces
+from gymnasium.utils import seeding
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+
+from ...graphs import GraphTable
+from ...names import shown
+from ...observations.tracking import N_REFERENCE
+from ...parameters import Array
+from ...tasks import TeamTask
+from ..pictures import NO_RENDERING, TeamPictures, checked_rendering
+from ..tracking.kernel import (
+    CAUSE,
+    CLIPPED,
+    COST,
+    CRASHED,
+    EPISODE_COST,
+    PLANT,
+    REWARD,
+    STAGE_COST,
+    STEP,
+    TRUNCATED,
+    VALUES,
+    VIOLATED,
+)
+from .batch import TeamBatch
+from .exchange import ALIVE, HEARD, NEAREST, SLOT_ERROR, TERMINATED, TERMS
+from .options import TeamOptions
+from .scores import N_LOSS
+
+Observation = NDArray[np.float32]
+Named = dict[str, Any]
+
+# PettingZoo asks for finite bounds; no state of a flight within the arena comes near.
+_BOUND = 1e6
+_METADATA: dict[str, Any] = {
+    "render_modes": ["human", "rgb_array"],
+    "render_fps": 20,
+    "name": "team",
+    "is_parallelizable": True,
+}
+# Entries of a row that `info` tells.
+_SAID = [COST, EPISODE_COST, VIOLATED, STAGE_COST, CRASHED, CAUSE, CLIPPED, SLOT_ERROR, NEAREST, HEARD]
+
+
+class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: ignore[misc]
+    """One team of a `TeamBatch`. The subclasses document their task."""
+
+    options_type: ClassVar[type[TeamOptions]] = TeamOptions
+    metadata: ClassVar[dict[str, Any]] = _METADATA
+
+    def __init__(
+        self, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480), **kwargs: Any
+    ) -> None:
+        picture_size = checked_rendering(render_mode, ("human", "rgb_array"), render_size)
+        # PettingZoo's wrappers write into it: every environment has its own.
+        self.metadata = {**_METADATA, "name": self.options_type.mission}  # type: ignore[misc]
+        self.render_mode = render_mode
+        options = self.options_type.from_kwargs(kwargs)
+        self._batch = TeamBatch(options, 1)
+        self._pictures = TeamPictures(self._batch, picture_size, render_mode) if render_mode else None
+        self.possible_agents = [f"quad_{i}" for i in range(options.vehicles)]
+        self.agents: list[str] = []
+        self.max_cycles = self.task.episode_steps
+        self.np_random: np.random.Generator | None = None
+        self._action_size = self.task.action_size
+        size = self.task.layout.size
+        self._shape = (options.vehicles, size)
+        self.observation_spaces = {
+            name: spaces.Box(-_BOUND, _BOUND, (size,), np.float32) for name in self.possible_agents
+        }
+        self.action_spaces = {
+            name: spaces.Box(-1.0, 1.0, (self._action_size,), np.float32) for name in self.possible_agents
+        }
+        state_size = sum(part.stop - part.start for part in self.state_slices.values())
+        self.state_space = spaces.Box(-_BOUND, _BOUND, (state_size,), np.float64)
+        self._rows = np.arange(options.vehicles)  # rows of the agents that fly
+
+    def observation_space(self, agent: str) -> spaces.Box:
+        """Of one agent; always the same object."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Box:
+        """Of one agent; always the same object."""
+        return self.action_spaces[agent]
+
+    @property
+    def task(self) -> TeamTask:
+        """What is known of the task before the flight: from this, policies are built."""
+        return self._batch.task
+
+    @property
+    def plants(self) -> Array:
+        """Copy of the plants [p, V_B, Theta, Omega, F], (N, 16), for study; policies never see it."""
+        return self._batch.rows[:, PLANT].copy()
+
+    @property
+    def references(self) -> Array:
+        """Where each vehicle should be in this episode, (N, T+1, 8), rows as in a reference. For study."""
+        return self._batch.wanted(0)
+
+    @property
+    def target(self) -> Array:
+        """Rows r, v of the target in this episode, (T+1, 6); zero where there is none. For study."""
+        return self._batch.target(0).copy()
+
+    @property
+    def graphs(self) -> GraphTable:
+        """Communication graphs of this episode, and which of them holds at each step. For study."""
+        graphs, which = self._batch.graphs
+        return GraphTable(graphs.copy(), which.copy())
+
+    @property
+    def senders(self) -> NDArray[np.int64]:
+        """Vehicle behind each comm slot, -1 for none, (N, K)."""
+        return self._batch.neighbours.copy()
+
+    @property
+    def state_slices(self) -> dict[str, slice]:
+        """Name -> slice of `state()`: plants, target, graph, preview, time."""
+        return self.task.state_slices
+
+    def state(self) -> Array:
+        """The whole truth for centralised critics, parts as in `state_slices`, absolute, float64.
+
+        Plants (N, 16) row by row; the target's r, v (zero without one); the present weights G (N, N), with
+        rows and columns of zeros, G_ii included, for vehicles that crashed; the leader's reference rows
+        k..k+N_p (zero without a leader); t / T.
+        """
+        batch, k = self._batch, int(self._batch.rows[0, STEP])
+        stages = self.task.layout.preview + 1
+        rows = batch.references[0, k : k + stages, :N_REFERENCE]
+        preview = rows if batch.options.has_leader else np.zeros((stages, N_REFERENCE))
+        alive = batch.rows[:, ALIVE]
+        graph = batch.graph(k) * alive * alive[:, None]
+        parts = (self.plants, batch.target(0)[k], graph, preview, k / self.task.episode_steps)
+        return np.concatenate([np.ravel(part) for part in parts])
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Observation], dict[str, Named]]:
+        """Begin an episode; `options={"state": x}` with (N, 12) or (N, 16) numbers sets the plants."""
+        if seed is not None or self.np_random is None:
+            self.np_random, _ = seeding.np_random(seed)
+        observations = self._fresh_observations()
+        self._batch.reset_team(0, self.np_random, observations, options)
+        if self._pictures:
+            self._pictures.record()
+        self.agents = self.possible_agents.copy()
+        self._rows = np.arange(len(self.agents))
+        return dict(zip(self.agents, observations, strict=True)), self._infos()
+
+    def step(
+        self, actions: dict[str, NDArray[np.float32]]
+    ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, Named]]:
+        """Hold the rotor commands of all agents over one control period.
+
+        After the end of an episode `step({})` answers with nothing, as PettingZoo's environments do.
+        """
+        agents = self.agents
+        if not agents and actions == {} and self.np_random is not None:
+            return {}, {}, {}, {}, {}
+        observations = self._fresh_observations()
+        stacked = self._stack(actions)
+        self._batch.step(stacked, observations)
+        if self._pictures:
+            self._pictures.record(stacked)
+        rows, which = self._batch.rows, self._rows
+        if len(which) < len(rows):
+            rows, observations = rows[which], observations[which]
+        terminated, truncated = rows[:, TERMINATED] > 0.0, rows[:, TRUNCATED] > 0.0
+        answer = (
+            dict(zip(agents, observations, strict=True)),
+            dict(zip(agents, rows[:, REWARD].tolist(), strict=True)),
+            dict(zip(agents, terminated.tolist(), strict=True)),
+            dict(zip(agents, truncated.tolist(), strict=True)),
+            self._infos(),
+        )
+        done = terminated | truncated
+        if done.any():
+            self._rows = which[~done]
+            self.agents = [self.possible_agents[i] for i in self._rows]
+        return answer
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """The picture of the present moment, (height, width, 3); with "human" it is in the window already."""
+        if self._pictures is None:
+            logger.warn(NO_RENDERING)
+            return None
+        return self._pictures.show()
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._pictures:
+            self._pictures.close()
+
+    def _fresh_observations(self) -> Observation:
+        return np.empty(self._shape, dtype=np.float32)
+
+    def _stack(self, actions: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
+        """Actions of all vehicles, (N, action_size); zero for those that left."""
+        agents = self.agents
+        try:
+            rows = [actions[name] for name in agents]
+            fits = set(map(len, rows)) == {self._action_size} and len(actions) == len(agents)
+            joined = np.concatenate(rows, dtype=np.float32, casting="same_kind")
+        except (KeyError, TypeError, ValueError):
+            fits = False
+        if not fits or joined.ndim != 1:
+            self._check(actions)
+            joined = np.concatenate([actions[name] for name in agents]).astype(np.float32)
+        if len(agents) == len(self.possible_agents):
+            return joined
+        out = np.zeros((len(self.possible_agents), self._action_size), dtype=np.float32)
+        out[self._rows] = joined.reshape(len(agents), self._action_size)
+        return out
+
+    def _check(self, actions: Any) -> None:
+        """Refuse what is not one action per agent.
+
+        Raises:
+            ValueError: If the environment is not in an episode, or it says which agent's action is wrong.
+        """
+        if not self.agents:
+            raise ValueError("no agent is flying: call reset() before step()")
+        if not isinstance(actions, dict):
+            raise ValueError(f"actions must be a dict agent -> action, got {type(actions).__name__}")
+        missing = [name for name in self.agents if name not in actions]
+        extra = [name for name in actions if name not in self.agents]
+        if missing or extra:
+            left = [name for name in extra if name in self.possible_agents]
+            remedy = f"; {', '.join(left)} left the episode" if left else ""
+            raise ValueError(
+                f"actions need one entry for each of env.agents: missing {missing}, extra {extra}{remedy}"
+            )
+        for name in self.agents:
+            action = actions[name]
+            if np.shape(action) != (self._action_size,) or not np.issubdtype(
+                np.asarray(action).dtype, np.number
+            ):
+                raise ValueError(f"action of {name} must be {self._action_size} numbers, got {shown(action)}")
+
+    def _infos(self) -> dict[str, Named]:
+        rows = self._batch.rows if len(self._rows) == len(self._batch.rows) else self._batch.rows[self._rows]
+        n = len(self.task.constraint_names)
+        infos = [
+            {
+                "cost": cost,
+                "episode_cost": total,
+                "constraint_violation": violated > 0.0,
+                "constraint_values": values,
+                "stage_cost": loss,
+                "crashed": crashed > 0.0,
+                "crash_cause": int(cause),
+                "clipped_actions": int(clipped),
+                "formation_error": error,
+                "min_separation": nearest,
+                "messages": int(heard),
+                "reward_terms": terms,
+            }
+            for (
+                (cost, total, violated, loss, crashed, cause, clipped, error, nearest, heard),
+                values,
+                terms,
+            ) in zip(
+                rows[:, _SAID].tolist(),
+                rows[:, VALUES : VALUES + n].copy(),
+                rows[:, TERMS : TERMS + N_LOSS + n].copy(),
+                strict=True,
+            )
+        ]
+        return dict(zip(self.agents, infos, strict=True))

@@ -1,0 +1,328 @@
+"""What vehicles learn of each other and of the target: sensing, messages, measurements, the observation.
+
+A vehicle's message is its CONTENT at one control step. Contents of the last `delay + 1` steps are kept, and
+of every neighbour the last message that was heard. A neighbour has the same slot for the whole episode.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..._numba import inline_kernel, kernel
+from ...observations.team import N_COMM, N_MEASURED, N_PLAN_STAGE, N_SENSED
+from ...observations.tracking import N_REFERENCE, encode_preview
+from ...parameters import Array
+from ...rotations import sincos
+from ...sensors import measure
+from ..tracking.kernel import DT, PREVIEW, STEP, encode_vehicle
+
+IntArray = NDArray[np.int64]
+
+# Entries of a vehicle's row beyond those of `kernel`.
+TERMS = 54  # of the stage cost (6) and the scaled violation of each named row (at most 5)
+SLOT_ERROR = 65  # m, distance to the wanted position
+NEAREST = 66  # m, distance to the nearest vehicle, smallest over the substeps
+HEARD = 67  # messages received in this step
+ALIVE = 68
+MEASURES = 69  # whether it has the sensor
+TERMINATED = 70
+LEFT = 71  # whether it crashed in an earlier step
+TEAM_ROW_SIZE = 72
+
+# Entries of a message's content, absolute.
+N_MOTION = 10  # p 3, v 3 (inertial), phi, theta, sin psi, cos psi
+MEASUREMENT = N_MOTION  # valid, range, sin and cos of azimuth, elevation
+PLAN = MEASUREMENT + N_MEASURED  # (p, v) of each stage
+# Before the content, a message that was heard has these.
+WEIGHT, SENT, RECEIVED = 0, 1, 2  # G_ij (0: nothing heard); control steps at which it was sent, received
+HEAD = 3
+
+# Entries of the team vector.
+(
+    SEPARATION,  # m, d_s
+    CRASH_DISTANCE,  # m, d_crash
+    SENSING_RADIUS,  # m, R_s
+    LIFETIME,  # control steps for which a message stays valid
+    DROP_OUT,  # probability that a message is lost
+    FORMATION_WEIGHT,
+    ARENA,  # m
+    WHOLE_TEAM,  # 1: a crash ends the episode of all
+    HAS_LEADER,
+    ON_RAILS,
+    SENSOR_ROWS,  # 0: no target, 1: range, 3: range-azimuth-elevation
+    DETECTION,  # probability that a measurement succeeds
+    PLAN_STAGES,
+    N_VALUES,  # named constraint rows
+    SENSED_SLOTS,  # K_s
+) = range(15)
+SIGMA = slice(15, 18)  # of range, azimuth, elevation
+SCALES = 18  # of the named rows, at most five
+TEAM_SIZE = 23
+
+
+class Tables(NamedTuple):
+    """What a team's step reads: who hears whom, and what was tabulated at reset."""
+
+    weights: Array  # (M, N, K), G_ij per graph and slot
+    neighbours: IntArray  # (N, K), sender of each slot, -1 for none
+    schedule: IntArray  # (T+1,), graph of each step
+    offsets: Array  # (N, K + 1, 3), delta_ij per slot, then p_i* relative to the leader or the target, m
+    which: IntArray  # (5, n), table that a row reads: reference, disturbance, noise, target, draw
+    references: Array  # (n_tables, n_steps, 9), of the leader
+    disturbances: Array  # (n_tables, n_steps, n_nodes, 6)
+    noises: Array  # (n_tables, n_steps, 12), of the vehicles' own state; no steps for none
+    targets: Array  # (n_tables, n_steps, 6), r and v of the target; no steps for none
+    draws: (
+        Array  # (n_tables, n_steps, N, 4 + K): measurement noise 3, detection, drop-outs; no steps for none
+    )
+
+
+# Rows of `which`.
+REFERENCE, DISTURBANCE, NOISE, TARGET, DRAW = range(5)
+
+
+@inline_kernel
+def motion(plant: Array, out: Array) -> None:
+    """p, inertial v, phi, theta, sin psi, cos psi of a plant (16,), into out (>= 10,)."""
+    sf, cf = sincos(plant[6])
+    st, ct = sincos(plant[7])
+    ss, cs = sincos(plant[8])
+    forward = ct * plant[3] + st * (sf * plant[4] + cf * plant[5])  # in the heading frame
+    right = cf * plant[4] - sf * plant[5]
+    out[0], out[1], out[2] = plant[0], plant[1], plant[2]
+    out[3], out[4] = cs * forward - ss * right, ss * forward + cs * right
+    out[5] = ct * (sf * plant[4] + cf * plant[5]) - st * plant[3]
+    out[6], out[7], out[8], out[9] = plant[6], plant[7], ss, cs
+
+
+@inline_kernel
+def measure_target(
+    own: Array, target: Array, draws: Array, k: int, i: int, measures: float, team: Array, out: Array
+) -> None:
+    """One vehicle's noisy measurement of the target.
+
+    Args:
+        own: Its true motion, (10,).
+        target: r, v, (6,).
+        draws: Of the team, (n_steps, N, 4 + K).
+        k: Control step.
+        i: Vehicle of the team.
+        measures: 1 if it has the sensor.
+        team: Team vector.
+        out: Result: valid, range, sin and cos of azimuth, elevation, (5,); zero where nothing is measured.
+    """
+    for c in range(N_MEASURED):
+        out[c] = 0.0
+    draw = draws[min(k, draws.shape[0] - 1), i]
+    if measures > 0.0 and draw[3] < team[DETECTION]:
+        rho, azimuth, elevation = measure(target[0] - own[0], target[1] - own[1], target[2] - own[2])
+        out[0] = 1.0
+        out[1] = rho + team[SIGMA][0] * draw[0]
+        if team[SENSOR_ROWS] > 1.0:
+            out[2], out[3] = sincos(azimuth + team[SIGMA][1] * draw[1])
+            out[4] = elevation + team[SIGMA][2] * draw[2]
+
+
+@kernel
+def hear(
+    k: int, i: int, rows: Array, first: int, history: Array, tables: Tables, team: Array, messages: Array
+) -> None:
+    """Take over the messages that reach vehicle i at step k, and drop those of crashed senders.
+
+    Args:
+        k: Control step.
+        i: Vehicle of the team.
+        rows: All vehicles.
+        first: Row of the team's first one.
+        history: Contents of the team's last steps, (depth, N, C).
+        tables: The tables.
+        team: Team vector.
+        messages: Of vehicle i, (K, HEAD + C), changed in place.
+    """
+    depth = history.shape[0]
+    sent = k - (depth - 1)
+    graph = tables.weights[tables.schedule[min(max(sent, 0), tables.schedule.shape[0] - 1)], i]
+    draws = tables.draws[tables.which[DRAW, first]]
+    rows[first + i, HEARD] = 0.0
+    for s in range(messages.shape[0]):
+        j, message = tables.neighbours[i, s], messages[s]
+        if j < 0:
+            continue
+        if rows[first + j, ALIVE] == 0.0:
+            message[WEIGHT] = 0.0
+            continue
+        if sent < 0 or graph[s] <= 0.0:
+            continue
+        if team[DROP_OUT] > 0.0 and draws[min(sent, draws.shape[0] - 1), i, 4 + s] < team[DROP_OUT]:
+            continue
+        message[WEIGHT], message[SENT], message[RECEIVED] = graph[s], float(sent), float(k)
+        content = history[sent % depth, j]
+        for c in range(content.shape[0]):
+            message[HEAD + c] = content[c]
+        rows[first + i, HEARD] += 1.0
+
+
+@kernel
+def sense(i: int, rows: Array, first: int, motions: Array, team: Array, key: Array, which: Array) -> int:
+    """The most urgent vehicles within the sensing radius of vehicle i, most urgent first.
+
+    Approaching ones by the time to contact max(|d| - d_s, 0) / closing speed, then the others by distance.
+
+    Args:
+        i: Vehicle of the team.
+        rows: All vehicles.
+        first: Row of the team's first one.
+        motions: True motions of the team, (N, 10).
+        team: Team vector.
+        key: Scratch, (K_s,).
+        which: Result, (K_s,).
+
+    Returns:
+        How many there are, at most K_s.
+    """
+    n, most, found = motions.shape[0], which.shape[0], 0
+    reach = team[SENSING_RADIUS] * team[SENSING_RADIUS]
+    own = motions[i]
+    for j in range(n):
+        dx, dy, dz = motions[j, 0] - own[0], motions[j, 1] - own[1], motions[j, 2] - own[2]
+        square = dx * dx + dy * dy + dz * dz
+        if square >= reach or j == i or rows[first + j, ALIVE] == 0.0:
+            continue
+        distance = math.sqrt(square)
+        parting = (
+            dx * (motions[j, 3] - own[3]) + dy * (motions[j, 4] - own[4]) + dz * (motions[j, 5] - own[5])
+        )
+        urgency = 1e6 + distance
+        if parting < 0.0:
+            urgency = max(distance - team[SEPARATION], 0.0) * distance / -parting
+        at = found
+        while at > 0 and key[at - 1] > urgency:
+            if at < most:
+                key[at], which[at] = key[at - 1], which[at - 1]
+            at -= 1
+        if at < most:
+            key[at], which[at] = urgency, float(j)
+            found = min(found + 1, most)
+    return found
+
+
+@inline_kernel
+def _is_valid(message: Array, k: int, team: Array) -> bool:
+    """Whether a message was heard and is not too old."""
+    return bool(message[WEIGHT] > 0.0 and float(k) - message[SENT] <= team[LIFETIME])
+
+
+@kernel
+def _encode_messages(
+    k: int,
+    messages: Array,
+    own: Array,
+    offsets: Array,
+    task: Array,
+    team: Array,
+    out: NDArray[np.float32],
+    at: int,
+) -> None:
+    """All comm slots from out[at] on, relative to what vehicle i knows of its own motion."""
+    tail = N_PLAN_STAGE * int(team[PLAN_STAGES])
+    for s in range(messages.shape[0]):
+        message = messages[s]
+        if _is_valid(message, k, team):
+            out[at] = message[WEIGHT]
+            out[at + 1] = (float(k) - message[SENT]) * task[DT]
+            for c in range(6):
+                out[at + 2 + c] = message[HEAD + c] - own[c]
+            for c in range(4):
+                out[at + 8 + c] = message[HEAD + 6 + c]
+            for c in range(3):
+                out[at + 12 + c] = offsets[s, c]
+            for c in range(tail):
+                out[at + N_COMM + c] = message[HEAD + PLAN + c] - own[c % N_PLAN_STAGE]
+        else:
+            for c in range(N_COMM + tail):
+                out[at + c] = 0.0
+        at += N_COMM + tail
+
+
+@kernel
+def _encode_measurements(
+    k: int, messages: Array, measurement: Array, team: Array, out: NDArray[np.float32], at: int
+) -> None:
+    """The own measurement, then those of the messages, each in the step in which its message arrives."""
+    for c in range(N_MEASURED):
+        out[at + c] = measurement[c]
+    for s in range(messages.shape[0]):
+        message = messages[s]
+        at += N_MEASURED
+        arrives = _is_valid(message, k, team) and int(message[RECEIVED]) == k
+        for c in range(N_MEASURED):
+            out[at + c] = message[HEAD + MEASUREMENT + c] if arrives else 0.0
+
+
+@kernel
+def observe_agent(
+    i: int,
+    row: Array,
+    seen: Array,
+    own: Array,
+    measurement: Array,
+    messages: Array,
+    motions: Array,
+    offsets: Array,
+    reference: Array,
+    disturbance: Array,
+    sensed: int,
+    which: Array,
+    task: Array,
+    team: Array,
+    out: NDArray[np.float32],
+) -> None:
+    """Write the observation of vehicle i, `agent_observations.AgentLayout`.
+
+    Args:
+        i: Vehicle of the team.
+        row: Its row.
+        seen: Its plant as it measures it, (16,).
+        own: Its motion as it measures it, (10,).
+        measurement: Of the target, (5,).
+        messages: What it heard, (K, HEAD + C).
+        motions: True motions of the team, (N, 10).
+        offsets: delta_ij per slot, then its slot, (K + 1, 3).
+        reference: The leader's, (n_steps, 9).
+        disturbance: Its own, (n_steps, n_nodes, 6).
+        sensed: How many vehicles it senses.
+        which: Those, (K_s,).
+        task: Task vector.
+        team: Team vector.
+        out: (layout.size,) float32.
+    """
+    k = int(row[STEP])
+    at = encode_vehicle(row, seen, disturbance, task, out)
+    leads = i == 0 and team[HAS_LEADER] > 0.0
+    out[at] = 1.0 if leads else 0.0
+    at += 1
+    stages = int(task[PREVIEW]) + 1
+    if leads:
+        encode_preview(out, at, reference, min(k, reference.shape[0] - stages), stages, own)
+    else:
+        for c in range(N_REFERENCE * stages):
+            out[at + c] = 0.0
+    at += N_REFERENCE * stages
+    _encode_messages(k, messages, own, offsets, task, team, out, at)
+    K = messages.shape[0]
+    at += K * (N_COMM + N_PLAN_STAGE * int(team[PLAN_STAGES]))
+    for s in range(which.shape[0]):
+        j = int(which[s]) if s < sensed else i  # relative to itself an empty slot is zero
+        out[at] = 1.0 if s < sensed else 0.0
+        for c in range(6):
+            out[at + 1 + c] = motions[j, c] - motions[i, c]
+        at += N_SENSED
+    if team[SENSOR_ROWS] > 0.0:
+        _encode_measurements(k, messages, measurement, team, out, at)
+        at += N_MEASURED * (1 + K)
+        for c in range(3):
+            out[at + c] = offsets[K, c]

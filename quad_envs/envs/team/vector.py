@@ -1,0 +1,171 @@
+"""Many teams at once: the batched form of the multi-agent environments, for training and sweeps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from ...checks import require_whole
+from ...parameters import Array
+from ...tasks import TeamTask
+from ..shared.vector_parts import Generators, score_infos, seeded, with_presence
+from ..tracking.kernel import PLANT, REWARD, TRUNCATED
+from .batch import TeamBatch
+from .exchange import ALIVE, HEARD, NEAREST, SLOT_ERROR, TERMINATED, TERMS
+from .options import TeamOptions
+from .scores import N_LOSS
+
+Observations = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+
+class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]):
+    """n teams stepped in one compiled call, equal agent by agent to n parallel environments.
+
+    Every agent is a row: vehicle i of team t is row t N + i, so that `num_envs` is n N and a policy that
+    treats rows alike is shared by all agents. A team begins anew in the step after its episode ended
+    (Gymnasium's NEXT_STEP), all of its rows at once; with `terminate="agent"` the rows of crashed vehicles
+    say terminated, and nothing counts there, until their team ends: `info["alive"]` tells which those are.
+
+    Args:
+        options: Of the task.
+        num_teams: Number of teams n.
+        autoreset_mode: NEXT_STEP (default) or DISABLED.
+
+    Raises:
+        ValueError: If num_teams < 1 or the mode is SAME_STEP.
+    """
+
+    def __init__(
+        self,
+        options: TeamOptions,
+        num_teams: int = 1,
+        *,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    ) -> None:
+        require_whole("num_teams", num_teams, 1)
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
+            raise ValueError("autoreset_mode must be NEXT_STEP or DISABLED for teams")
+        self._batch = TeamBatch(options, int(num_teams))
+        self.num_teams, self.num_envs = int(num_teams), int(num_teams) * options.vehicles
+        self.render_mode = None
+        self.metadata = {"render_modes": [], "render_fps": 20, "autoreset_mode": self.autoreset_mode}
+        size = self.task.layout.size
+        self.single_action_space = spaces.Box(-1.0, 1.0, (self.task.action_size,), np.float32)
+        self.single_observation_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self._generators: Generators = []
+        self._done: Bools = np.zeros(self.num_teams, dtype=np.bool_)
+        self._seen = np.zeros((self.num_envs, size), dtype=np.float32)  # for teams that a reset leaves alone
+
+    @property
+    def task(self) -> TeamTask:
+        """What is known of the task before the flight."""
+        return self._batch.task
+
+    @property
+    def plants(self) -> Array:
+        """Copy of the plants [p, V_B, Theta, Omega, F], (n N, 16). For study and tests."""
+        return self._batch.rows[:, PLANT].copy()
+
+    @property
+    def references(self) -> Array:
+        """Where each vehicle should be in its team's episode, (n N, T+1, 8). For study and tests."""
+        return np.concatenate([self._batch.wanted(t) for t in range(self.num_teams)])
+
+    @property
+    def targets(self) -> Array:
+        """Rows r, v of each team's target, (n, T+1, 6); zero where there is none. For study and tests."""
+        return np.stack([self._batch.target(t) for t in range(self.num_teams)])
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Begin episodes: of every team, or of those in `options["reset_mask"]`.
+
+        Args:
+            seed: One number s (team t gets s + t), one per team, or None to draw on; a team that goes on
+                keeps its generator.
+            options: As in the parallel environment, the same for all teams; "reset_mask" is bool, one per
+                team, or one per row with all rows of a team alike.
+
+        Raises:
+            ValueError: If the mask does not fit, or leaves out a team before the first reset.
+        """
+        given = dict(options or {})
+        mask = self._team_mask(given.pop("reset_mask", None))
+        self._generators = seeded(self._generators, seed, mask)
+        observations = self._seen.copy()
+        for t in np.flatnonzero(mask).tolist():
+            self._reset_team(t, observations, given)
+        self._done[mask] = False
+        self._seen = observations.copy()
+        return observations, self._info()
+
+    def _team_mask(self, mask: Any) -> Bools:
+        """Which teams a reset begins anew, (n,)."""
+        if mask is None:
+            return np.ones(self.num_teams, dtype=np.bool_)
+        given = np.asarray(mask, dtype=np.bool_)
+        if given.shape == (self.num_envs,):
+            rows = given.reshape(self.num_teams, -1)
+            if (rows.any(axis=1) != rows.all(axis=1)).any():
+                raise ValueError("reset_mask must be alike for all vehicles of a team: a team begins as one")
+            given = np.asarray(rows.all(axis=1))
+        if given.shape != (self.num_teams,):
+            raise ValueError(
+                f"reset_mask must have shape ({self.num_teams},) or ({self.num_envs},), got {given.shape}"
+            )
+        if not (given.all() or self._generators):
+            raise ValueError("the first reset must begin all teams; reset_mask is for later ones")
+        return given
+
+    def step(self, actions: NDArray[np.float32]) -> tuple[Observations, Array, Bools, Bools, dict[str, Any]]:
+        """Hold the rotor commands of all vehicles over one control period."""
+        actions = np.ascontiguousarray(actions, dtype=np.float32)
+        if actions.shape != self.action_space.shape:
+            raise ValueError(f"actions must have shape {self.action_space.shape}, got {actions.shape}")
+        if not self._generators:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        anew = self._done if self.autoreset_mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._done)
+        begins = np.repeat(anew, self.task.vehicles)
+        if anew.any():
+            actions = np.where(begins[:, None], np.float32(0.0), actions)
+        observations = self._fresh_observations()
+        self._batch.step(actions, observations)
+        for t in np.flatnonzero(anew).tolist():
+            self._reset_team(t, observations, None)
+        rows = self._batch.rows
+        rewards = np.where(begins, 0.0, rows[:, REWARD])
+        terminated = rows[:, TERMINATED] > 0.0
+        truncated = (rows[:, TRUNCATED] > 0.0) & ~terminated
+        self._done = np.asarray((terminated | truncated).reshape(self.num_teams, -1).all(axis=1))
+        self._seen = observations
+        return observations, rewards, terminated, truncated, self._info()
+
+    def _reset_team(self, t: int, observations: Observations, options: dict[str, Any] | None) -> None:
+        n = self.task.vehicles
+        self._batch.reset_team(t, self._generators[t], observations[t * n : (t + 1) * n], options)
+
+    def _fresh_observations(self) -> Observations:
+        return np.empty((self.num_envs, self.task.layout.size), dtype=np.float32)
+
+    def _info(self) -> dict[str, Any]:
+        rows, n = self._batch.rows, len(self.task.constraint_names)
+        info = score_infos(rows, n) | {
+            "formation_error": rows[:, SLOT_ERROR].copy(),
+            "min_separation": rows[:, NEAREST].copy(),
+            "messages": rows[:, HEARD].astype(np.int64),
+            "reward_terms": rows[:, TERMS : TERMS + N_LOSS + n].copy(),
+            "alive": rows[:, ALIVE] > 0.0,
+        }
+        return with_presence(info, self.num_envs)

@@ -1,0 +1,1 @@
+"""One vehicle follows a reference: the environments and their compiled step."""

@@ -1,0 +1,185 @@
+"""One quadrotor follows a reference: the single environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from ...episode_limit import steps_asked
+from ...observations.tracking import N_REFERENCE
+from ...parameters import Array
+from ...tasks import Task
+from ..pictures import NO_RENDERING, RenderModes, TrackingPictures, checked_rendering
+from ..shared.specified import Specified
+from .batch import TrackingBatch
+from .kernel import CAUSE, PLANT, SCORES, VALUES
+from .options import TrackingOptions
+
+Observation = NDArray[np.float32]
+
+# Entries of SCORES.
+_REWARD, _STAGE_COST, _COST, _EPISODE_COST, _VIOLATED, _CRASHED, _TRUNCATED, _CLIPPED = range(8)
+_CAUSE = CAUSE - SCORES.start
+
+
+class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
+    """A quadrotor follows a reference trajectory within limits.
+
+    ## Description
+    The plant is the 12-state rigid body of Ru (2017) with first-order rotors, z down, integrated by RK4 with
+    the rotor lag in closed form. The registered ids differ in their default reference, start and limits only.
+
+    ## Action Space
+    `Box(-1, 1, (4,), float32)`: rotor force commands. -1 is no force, 0 hover (m g / 4), +1 kappa m g; linear
+    in between. A non-finite action raises ValueError; one outside the box is clipped and counted
+    (`info["clipped_actions"]`).
+
+    ## Observation Space
+    One flat float32 Box, see `quad_envs.observations.tracking`: `env.unwrapped.task.layout.slices` names the parts and
+    `layout.decode` takes them apart. It holds the vehicle's own state, the last command and the coming
+    reference relative to the vehicle.
+
+    ## Rewards
+    `(1 - v) / (1 + l)` with the stage cost l = |x - x_ref|_Q^2 + |u - u_T|_R^2 and v in [0, 1] the violation
+    of the limits; 0 in the step of a crash. `reward="quadratic"` gives -l - v instead.
+
+    ## Starting State
+    Hover at `start`, each component drawn from +- `start_box`. `reset(options={"state": x})` puts the plant
+    elsewhere.
+
+    ## Episode Termination
+    Crash: |roll| or |pitch| >= 85 degrees, farther than `lost_distance` from the reference, or a state that
+    is no longer finite (or above 1e30). Truncation after `time_limit`.
+
+    ## Info
+    At every step and at reset: `cost` (sum of hinge / scale over the limits), `episode_cost` (its running
+    sum), `constraint_violation` (bool), `constraint_values` (value minus limit of each of
+    `task.constraint_names`), `stage_cost`, `crashed`, `crash_cause` (place in `task.crash_causes`: 0 none,
+    2 "tilt", 4 "not finite", 5 "lost"), `clipped_actions`.
+
+    ## Arguments
+    Vehicle: `vehicle` (a name of `quad_envs.vehicles.VEHICLES`, whose values the others override), `frame`
+        "plus" or "x", `mass` 0.8 kg, `gravity` 9.8 m/s^2, `inertia` (0.0224, 0.0224, 0.0436) kg m^2, `arm`
+        0.165 m, `yaw_moment` 0.002167 m, `rotor_rate` 50 1/s, `drag` 0 kg/s.
+    Limits: `kappa` 1 (largest rotor force as a fraction of the weight, in (1/4, 20]; one number, or one per
+    rotor), `rate_limit` N/s per rotor,
+        `tilt_limit` rad on |roll| and |pitch|, `velocity_limit` m/s on each body velocity, `position_limit`
+        ((x, y, z) lower, (x, y, z) upper) m. No limit but kappa by default.
+    Task: `reference` (a name, or whatever `quad_envs.references.make_reference` takes), `start` (3 or 12
+        numbers, or "reference": on it, with its velocity and heading), `start_box` (half widths: 1 or 3
+        numbers of the position or 12 of the state; 1 m, on the reference 0), `time_limit` 10 s (or
+        "reference": as long as that is given) or `max_episode_steps`, as in `gymnasium.make`, `dt` 0.05 s,
+        `substeps` 5, `preview` 25 stages of the reference in the observation, `Q` and `R` (diagonals, 1),
+        `reward` "bounded" or "quadratic", `lost_distance` 50 m.
+    Uncertainty: `disturbance` (None, a name, a force, or whatever `make_disturbance` takes),
+        `reveal_disturbance` (puts its mean over the coming period into the observation), `sensor_noise`
+        (standard deviations of position m, velocity m/s, attitude rad, rates rad/s, or one number for all),
+        `randomize` (relative spread of mass, inertia, arm, kappa, rotor_rate, drag at reset: a mapping or
+        one number for all; the largest principal moment is at most the sum of the others).
+
+    Rendering: `render_mode` None or "rgb_array" (`gymnasium.make` makes "human" of it), `render_size`
+        (640, 480) pixels.
+
+    ## References
+    G. Ru, Nonlinear Model Predictive Control for Cooperative Control and Estimation, 2017, chapters 2 to 4.
+    """
+
+    metadata = {"render_modes": RenderModes(["rgb_array"]), "render_fps": 20}  # noqa: RUF012 (Gymnasium's own form)
+
+    def __init__(
+        self, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480), **kwargs: Any
+    ) -> None:
+        size = checked_rendering(render_mode, ("rgb_array",), render_size)
+        asked = steps_asked()
+        if asked is not None:
+            kwargs["max_episode_steps"] = asked
+        self.render_mode = render_mode
+        self._batch = TrackingBatch(TrackingOptions.from_kwargs(kwargs), 1)
+        self._pictures = TrackingPictures(self._batch, 0, size) if render_mode else None
+        self._bind()
+        self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (self._size,), np.float32)
+
+    def _bind(self) -> None:
+        """Views of the batch's only row, made once because slicing takes longer than reading."""
+        row = self._batch.rows[0]
+        self._scores, self._plant = row[SCORES], row[PLANT]
+        self._values = row[VALUES : VALUES + len(self.task.constraint_names)]
+        self._size = self.task.layout.size
+
+    def __getstate__(self) -> dict[str, Any]:
+        views = ("_scores", "_plant", "_values", "_size")
+        return {key: value for key, value in self.__dict__.items() if key not in views}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._bind()
+
+    @property
+    def task(self) -> Task:
+        """What is known of the task before the flight: from this, policies are built."""
+        return self._batch.task
+
+    @property
+    def state(self) -> Array:
+        """Copy of the plant [p, V_B, Theta, Omega, F], (16,), for study and tests; policies never see it."""
+        return np.array(self._plant)
+
+    @property
+    def reference(self) -> Array:
+        """Copy of this episode's reference rows from the start on, (n_steps, 8). For study and tests."""
+        return np.array(self._batch.references[0, :, :N_REFERENCE])
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode; `options={"state": x}` with 12 or 16 numbers sets the plant."""
+        super().reset(seed=seed)
+        observation = np.empty(self._size, dtype=np.float32)
+        self._batch.reset_row(0, self.np_random, observation, options)
+        if self._pictures:
+            self._pictures.record()
+        return observation, self._info(self._scores.tolist())
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Hold the rotor commands over one control period."""
+        if self._np_random is None:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        actions = np.ascontiguousarray(action, dtype=np.float32)
+        if actions.shape != (4,):
+            raise ValueError(f"action must have shape (4,), one entry per rotor, got {actions.shape}")
+        observation = np.empty(self._size, dtype=np.float32)
+        self._batch.step(actions, observation)
+        if self._pictures:
+            self._pictures.record()
+        scores = self._scores.tolist()
+        return (
+            observation,
+            scores[_REWARD],
+            scores[_CRASHED] > 0.0,
+            scores[_TRUNCATED] > 0.0,
+            self._info(scores),
+        )
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """The picture of the present moment, (height, width, 3), with `render_mode="rgb_array"`."""
+        if self._pictures is None:
+            gymnasium.logger.warn(NO_RENDERING)
+            return None
+        return self._pictures.frame()
+
+    def _info(self, scores: list[float]) -> dict[str, Any]:
+        return {
+            "cost": scores[_COST],
+            "episode_cost": scores[_EPISODE_COST],
+            "constraint_violation": scores[_VIOLATED] > 0.0,
+            "constraint_values": self._values.copy(),
+            "stage_cost": scores[_STAGE_COST],
+            "crashed": scores[_CRASHED] > 0.0,
+            "crash_cause": int(scores[_CAUSE]),
+            "clipped_actions": int(scores[_CLIPPED]),
+        }

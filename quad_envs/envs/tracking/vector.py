@@ -1,0 +1,194 @@
+"""Many quadrotors follow references at once: the native vector environment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from ...checks import require_whole
+from ...observations.tracking import N_REFERENCE
+from ...parameters import Array
+from ...tasks import Task
+from ..pictures import NO_RENDERING, TrackingPictures, checked_rendering
+from ..shared.given import as_numbers
+from ..shared.specified import Specified
+from ..shared.vector_parts import Generators, score_infos, seeded, with_presence
+from .batch import TrackingBatch
+from .kernel import CRASHED, PLANT, REWARD, TRUNCATED
+from .options import TrackingOptions
+
+Observations = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+_Step = tuple[Observations, Array, Bools, Bools, dict[str, Any]]
+
+
+class TrackingVectorEnv(
+    Specified, gymnasium.vector.VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]
+):
+    """n tracking tasks stepped in one compiled call, equal row by row to n `TrackingEnv` with the same seeds.
+
+    Args:
+        num_envs: Number of flights.
+        autoreset_mode: Gymnasium's NEXT_STEP (default), SAME_STEP or DISABLED.
+        render_mode: None or "rgb_array".
+        render_size: Width and height of each picture, pixels.
+        kwargs: As for `TrackingEnv`.
+
+    Raises:
+        ValueError: If num_envs < 1 or an argument is not valid.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        render_size: tuple[int, int] = (640, 480),
+        **kwargs: Any,
+    ) -> None:
+        require_whole("num_envs", num_envs, 1)
+        size = checked_rendering(render_mode, ("rgb_array",), render_size)
+        options = TrackingOptions.from_kwargs(kwargs)
+        self.num_envs, self.render_mode = num_envs, render_mode
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {
+            "render_modes": ["rgb_array"],
+            "render_fps": 20,
+            "autoreset_mode": self.autoreset_mode,
+        }
+        self._batch = TrackingBatch(options, num_envs)
+        shown = range(num_envs) if render_mode else range(0)
+        self._pictures = [TrackingPictures(self._batch, i, size) for i in shown]
+        self._n_values = len(self.task.constraint_names)
+        self.single_action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
+        self.single_observation_space = spaces.Box(-np.inf, np.inf, (self.task.layout.size,), np.float32)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._generators: Generators = []
+        self._done = np.zeros(num_envs, dtype=np.bool_)
+
+    @property
+    def task(self) -> Task:
+        """What is known of the task before the flight."""
+        return self._batch.task
+
+    @property
+    def state(self) -> Array:
+        """Copy of the plant states [p, V_B, Theta, Omega, F], (n, 16). For study and tests."""
+        return self._batch.rows[:, PLANT].copy()
+
+    @property
+    def reference(self) -> Array:
+        """Copy of the reference rows of the present episodes, (n, n_steps, 8). For study and tests."""
+        tables = self._batch.references[:, :, :N_REFERENCE]
+        return np.repeat(tables, self.num_envs, axis=0) if len(tables) == 1 else tables.copy()
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Begin episodes: in all rows, or in those of `options["reset_mask"]` (bool, (n,)).
+
+        Args:
+            seed: One number s (row i gets s + i), one per row, or None to draw on.
+            options: `{"state": x}` sets the plants, 12 or 16 numbers for all or one such row for each.
+        """
+        given = dict(options or {})
+        mask = np.asarray(given.pop("reset_mask", np.ones(self.num_envs)), dtype=np.bool_)
+        if mask.shape != (self.num_envs,):
+            raise ValueError(f"reset_mask must have shape ({self.num_envs},), got {mask.shape}")
+        if not (mask.all() or self._generators):
+            raise ValueError("the first reset must begin all rows; reset_mask is for later ones")
+        states = self._given_states(given.pop("state", None))
+        self._generators = seeded(self._generators, seed, mask)
+        observations = self._fresh_observations()
+        for i in range(self.num_envs):
+            if mask[i]:
+                one = given if states is None else {**given, "state": states[i]}
+                self._batch.reset_row(i, self._generators[i], observations[i], one)
+            else:
+                self._batch.observe(i, observations[i])
+        self._done[mask] = False
+        for i, pictures in enumerate(self._pictures):
+            if mask[i]:
+                pictures.record()
+        return observations, self._info()
+
+    def step(self, actions: NDArray[np.float32]) -> _Step:
+        """Hold the rotor commands of all flights over one control period."""
+        actions = np.ascontiguousarray(actions, dtype=np.float32)
+        if actions.shape != (self.num_envs, 4):
+            raise ValueError(f"actions must have shape ({self.num_envs}, 4), got {actions.shape}")
+        if not self._generators:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        finished = self._done
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP and finished.any():
+            actions = np.where(finished[:, None], np.float32(0.0), actions)
+        observations = self._fresh_observations()
+        self._batch.step(actions, observations)
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+            self._reset_rows(finished, observations)
+        rows = self._batch.rows
+        rewards = rows[:, REWARD].copy()
+        terminated, truncated = rows[:, CRASHED] > 0.0, rows[:, TRUNCATED] > 0.0
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+            rewards[finished] = 0.0
+        self._done = terminated | truncated
+        info = self._info()
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and self._done.any():
+            info = self._reset_in_same_step(observations, info)
+        for pictures in self._pictures:
+            pictures.record()
+        return observations, rewards, terminated, truncated, info
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """One picture of each flight, (height, width, 3), with `render_mode="rgb_array"`."""
+        if not self._pictures:
+            gymnasium.logger.warn(NO_RENDERING)
+            return None
+        return tuple(pictures.frame() for pictures in self._pictures)
+
+    def _given_states(self, state: Any) -> Array | None:
+        """Start states from the reset options, one row per flight."""
+        if state is None:
+            return None
+        states = as_numbers(state)
+        if states.ndim == 1:
+            states = np.tile(states, (self.num_envs, 1))
+        if states.ndim != 2 or len(states) != self.num_envs:
+            raise ValueError(
+                f"reset option 'state' must be one state for all or {self.num_envs} rows, "
+                f"got shape {states.shape}"
+            )
+        return states
+
+    def _reset_rows(self, which: Bools, observations: Observations) -> None:
+        for i in np.flatnonzero(which).tolist():
+            self._batch.reset_row(i, self._generators[i], observations[i])
+
+    def _reset_in_same_step(self, observations: Observations, info: dict[str, Any]) -> dict[str, Any]:
+        """Begin anew where an episode ended; what was before travels in `final_obs` and `final_info`."""
+        done = self._done
+        final = np.full(self.num_envs, None, dtype=object)
+        for i in np.flatnonzero(done).tolist():
+            final[i] = observations[i].copy()
+        self._reset_rows(done, observations)
+        fresh = self._info()
+        fresh["final_obs"], fresh["_final_obs"] = final, done.copy()
+        last = {key: value.copy() for key, value in info.items() if not key.startswith("_")}
+        fresh["final_info"] = last | {f"_{key}": done.copy() for key in last}
+        fresh["_final_info"] = done.copy()
+        return fresh
+
+    def _fresh_observations(self) -> Observations:
+        return np.empty((self.num_envs, self.task.layout.size), dtype=np.float32)
+
+    def _info(self) -> dict[str, Any]:
+        return with_presence(score_infos(self._batch.rows, self._n_values), self.num_envs)

@@ -1,0 +1,1 @@
+"""What policies see: layouts with named slices, encoders and decoders."""

@@ -1,0 +1,197 @@
+"""Layout of the tracking observation: named slices, decoding, and the compiled encoder.
+
+| slice | size | content |
+|---|---|---|
+| own | 18 | V_B 3, phi, theta, sin psi, cos psi, Omega 3, rotor forces 4, last command 4 |
+| position | 3 | p, only where the task limits the position |
+| disturbance | 6 | torque (body, N m), force (inertial, N) in the middle of the period, where revealed |
+| preview | 8 (preview + 1) | p_ref - p 3, v_ref 3, sin psi_ref, cos psi_ref for k..k+preview |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .._numba import inline_kernel
+from ..parameters import Array
+from ..rotations import sincos
+
+N_OWN = 18
+N_REFERENCE = 8  # p_ref (or p_ref - p) 3, v_ref 3 (inertial), sin psi_ref, cos psi_ref
+
+
+class TrackingView(NamedTuple):
+    """The parts of tracking observations, batch axes first, float64."""
+
+    V_B: Array  # (..., 3), m/s
+    Theta: Array  # (..., 3), rad, yaw in (-pi, pi]
+    Omega: Array  # (..., 3), rad/s
+    F: Array  # (..., 4), N
+    last_command: Array  # (..., 4), N
+    position: Array  # (..., 3), m; zero where the task does not observe it
+    torque: Array  # (..., 3), N m; zero where not revealed
+    force: Array  # (..., 3), N; zero where not revealed
+    preview: Array  # (..., preview + 1, 8): p_ref - p, v_ref, sin psi_ref, cos psi_ref
+
+
+@dataclass(frozen=True, slots=True)
+class TrackingLayout:
+    """Which parts a tracking observation has and where they stand.
+
+    Raises:
+        ValueError: If preview is negative.
+    """
+
+    preview: int = 25  # stages of the reference after the present one
+    position: bool = False
+    disturbance: bool = False
+
+    def __post_init__(self) -> None:
+        if self.preview < 0:
+            raise ValueError(f"preview must be >= 0 control periods, got {self.preview}")
+
+    @property
+    def slices(self) -> dict[str, slice]:
+        """Name -> slice of the flat observation; the parts of `own` are named, too."""
+        parts = [
+            ("V_B", 3),
+            ("phi_theta", 2),
+            ("sin_cos_psi", 2),
+            ("Omega", 3),
+            ("F", 4),
+            ("last_command", 4),
+        ]
+        if self.position:
+            parts.append(("position", 3))
+        if self.disturbance:
+            parts.append(("disturbance", 6))
+        parts.append(("preview", N_REFERENCE * (self.preview + 1)))
+        out, start = {"own": slice(0, N_OWN)}, 0
+        for name, size in parts:
+            out[name] = slice(start, start + size)
+            start += size
+        return out
+
+    @property
+    def preview_start(self) -> int:
+        """Index at which the preview begins."""
+        return N_OWN + 3 * self.position + 6 * self.disturbance
+
+    @property
+    def size(self) -> int:
+        """Length of the observation."""
+        return self.preview_start + N_REFERENCE * (self.preview + 1)
+
+    def decode(self, observation: NDArray[np.floating]) -> TrackingView:
+        """Split observations into named parts.
+
+        Args:
+            observation: (..., size).
+
+        Returns:
+            The parts with yaw as an angle.
+
+        Raises:
+            ValueError: If the last axis has another length.
+        """
+        obs = as_observations(observation, self.size)
+        part = {name: obs[..., where] for name, where in self.slices.items()}
+        batch = obs.shape[:-1]
+        return TrackingView(
+            **vehicle_parts(part, batch),
+            preview=part["preview"].reshape(*batch, self.preview + 1, N_REFERENCE),
+        )
+
+
+def as_observations(observation: NDArray[np.floating], size: int) -> Array:
+    """Observations (..., size) as float64.
+
+    Raises:
+        ValueError: If the last axis has another length.
+    """
+    obs = np.asarray(observation, dtype=np.float64)
+    if obs.shape[-1:] != (size,):
+        raise ValueError(f"observation must have {size} entries on its last axis, got shape {obs.shape}")
+    return obs
+
+
+def vehicle_parts(part: Mapping[str, Array], batch: tuple[int, ...]) -> dict[str, Array]:
+    """What every view begins with, from `V_B` to `force`: yaw as an angle, zero for what is not observed.
+
+    Args:
+        part: Name -> slice of the observations, (*batch, size of the part).
+        batch: Leading axes.
+    """
+    psi = np.arctan2(part["sin_cos_psi"][..., :1], part["sin_cos_psi"][..., 1:])
+    zero = np.zeros((*batch, 6))
+    disturbance = part.get("disturbance", zero)
+    return {
+        "V_B": part["V_B"],
+        "Theta": np.concatenate([part["phi_theta"], psi], axis=-1),
+        "Omega": part["Omega"],
+        "F": part["F"],
+        "last_command": part["last_command"],
+        "position": part.get("position", zero[..., :3]),
+        "torque": disturbance[..., :3],
+        "force": disturbance[..., 3:],
+    }
+
+
+@inline_kernel
+def encode_own(out: NDArray[np.float32], plant: Array, command: Array) -> None:
+    """Write the `own` block.
+
+    Args:
+        out: Observation, (>= 18,) float32.
+        plant: Measured [p, V_B, Theta, Omega, F], (16,).
+        command: Last rotor commands, (4,), N.
+    """
+    for i in range(3):
+        out[i] = plant[3 + i]
+        out[7 + i] = plant[9 + i]
+    out[3] = plant[6]
+    out[4] = plant[7]
+    sine, cosine = sincos(plant[8])
+    out[5] = sine
+    out[6] = cosine
+    for i in range(4):
+        out[10 + i] = plant[12 + i]
+        out[14 + i] = command[i]
+
+
+@inline_kernel
+def decode_own(row: NDArray[np.float32], plant: Array, command: Array) -> None:
+    """Read the `own` block; the position in the plant is left as it is.
+
+    Args:
+        row: Observation, (>= 18,) float32.
+        plant: Result, [p, V_B, Theta, Omega, F], (16,).
+        command: Result, last rotor commands, (4,), N.
+    """
+    for i in range(3):
+        plant[3 + i] = row[i]
+        plant[9 + i] = row[7 + i]
+    plant[6] = row[3]
+    plant[7] = row[4]
+    plant[8] = np.arctan2(np.float64(row[5]), np.float64(row[6]))
+    for i in range(4):
+        plant[12 + i] = row[10 + i]
+        command[i] = row[14 + i]
+
+
+@inline_kernel
+def encode_preview(
+    out: NDArray[np.float32], start: int, reference: Array, row: int, stages: int, p: Array
+) -> None:
+    """Write reference rows row..row+stages-1 from out[start] on, positions relative to p."""
+    target = out[start : start + N_REFERENCE * stages].reshape(stages, N_REFERENCE)
+    for q in range(stages):
+        for i in range(3):
+            target[q, i] = reference[row + q, i] - p[i]
+        for i in range(3, N_REFERENCE):
+            target[q, i] = reference[row + q, i]

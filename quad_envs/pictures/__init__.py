@@ -1,0 +1,1 @@
+"""Pictures of flights: from a scene to pixels and windows."""
