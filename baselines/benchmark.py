@@ -11,13 +11,15 @@ from pathlib import Path
 from typing import Any
 
 from .evaluation.amounts import require_jobs
-from .files import locked
+from .files import locked, write_atomic
 from .policies.environments import make_env
 from .policies.outside import name_of
-from .policies.registry import from_outside, is_trained, make_policy, mission_of, policy_entry
+from .policies.registry import from_outside, is_trained, make_policy, policy_entry
+from .report import render_report
 from .sweeps.comparison import Results
 from .sweeps.engines import check_engine
 from .sweeps.finished import training_plan
+from .sweeps.folder import read_run
 from .sweeps.suite import PolicyChoice, Suite
 from .sweeps.suite_files import load_suite
 from .sweeps.sweep import Order, Sweep, with_given
@@ -99,7 +101,10 @@ def fly_suite(
     with nullcontext() if folder is None else locked(folder):
         sweep = Sweep(suite, given, failed, folder, order)
         sweep.go()
-        return sweep.finish()
+        results = sweep.finish()
+        if folder is not None:
+            write_atomic(folder / "report.html", render_report(read_run(folder)).encode())
+        return results
 
 
 def _refuse_no_folder(suite: Suite, out: str | Path | None, order: Order) -> None:
@@ -142,6 +147,6 @@ def _refuse_bad_policy(unit: Unit, env: Any) -> None:
         make_policy(unit.source, env, **unit.policy.kwargs)
     except ValueError as error:
         known = from_outside(unit.source) or is_trained(unit.source)
-        if known or mission_of(env.unwrapped.task) in policy_entry(unit.source).missions:
+        if known or env.unwrapped.task.mission in policy_entry(unit.source).missions:
             raise
         raise ValueError(f"{error}. Say in the suite for which it is: envs = [...]") from error

@@ -35,6 +35,11 @@ class BaseTask:
     reward: str = "bounded"  # or "quadratic"
 
     @property
+    def mission(self) -> str:
+        """What there is to do: "tracking", "formation", "target-tracking" or "estimation"."""
+        return "tracking"
+
+    @property
     def constraint_names(self) -> tuple[str, ...]:
         """Names of the entries of `info["constraint_values"]`."""
         return constraint_names(self.limits)

@@ -16,7 +16,6 @@ from baselines.policies.decoding import decode_rows, empty_parts, part_starts
 from baselines.policies.registry import (
     TEAM_MISSIONS,
     TEAM_POLICIES,
-    mission_of,
     policy_entry,
     policy_options,
     serving,
@@ -273,7 +272,7 @@ def test_the_options_of_a_policy_have_the_defaults_of_its_controller(name, own):
 
 
 def test_a_mission_is_that_of_the_task():
-    assert mission_of(formation_v0.parallel_env().task) == "formation"
+    assert formation_v0.parallel_env().task.mission == "formation"
 
 
 def test_a_privileged_policy_sees_the_state():

@@ -3,10 +3,10 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from baselines.evaluation.record import Record
 
 from baselines import evaluate, make_policy, measure, run_episodes
 from baselines.evaluation.metrics import crash_causes
+from baselines.evaluation.record import Record
 from quad_envs import formation_v0
 
 HOVER = np.zeros(4, np.float32)

@@ -8,13 +8,13 @@ import pickle
 
 import numpy as np
 import pytest
-from baselines.evaluation.record import TEAM_COLUMNS, Record
 
 from baselines import evaluate, load_suite, make_policy, measure, run_benchmark, run_episodes
 from baselines.__main__ import main
 from baselines.evaluation.episode import Episode
 from baselines.evaluation.evaluate import Evaluation
 from baselines.evaluation.metrics import estimate, paired_difference, summarize, totals
+from baselines.evaluation.record import TEAM_COLUMNS, Record
 from baselines.evaluation.team_metrics import flight_values
 from baselines.policies.environments import make_env, task_of
 from baselines.policies.estimate_wrapper import EstimateWrapper

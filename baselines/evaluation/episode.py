@@ -33,7 +33,7 @@ _N_ROTORS = 4
 class Episode(NamedTuple):
     """One flight of T control periods. Row k of what is per step belongs to the step from k to k + 1.
 
-    `signals` has what only some environments and policies tell, first axis T, see `baselines.evaluation.team_signals`.
+    `signals` has what only some environments and policies tell, first axis T, see `team_signals.py`.
     """
 
     task: BaseTask  # as flown: with the time limit that Gymnasium set, where that one is shorter

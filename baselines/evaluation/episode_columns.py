@@ -16,7 +16,7 @@
 | violated | 0, 1 | whether any limit was exceeded |
 | limit_... | SI | value minus limit, one column per row of `task.constraint_names` |
 | decision_time | s | wall time in `predict` per vehicle; nan where it was not measured |
-| others | | what a team adds, see `baselines.evaluation.team_signals`; entries of arrays as name_0, name_0_1, ... |
+| others | | what a team adds, see `team_signals.py`; entries of arrays as name_0, name_0_1, ... |
 """
 
 from __future__ import annotations
@@ -24,15 +24,12 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quad_envs.parameters import Array
-
-if TYPE_CHECKING:
-    from .episode import Episode
 
 _FORCES = ("F1", "F2", "F3", "F4")
 _STATE = ("x", "y", "z", "u", "v", "w", "phi", "theta", "psi", "p", "q", "r", *_FORCES)
@@ -46,8 +43,8 @@ _STEP = {
 }
 
 
-def episode_columns(episode: Episode) -> dict[str, Array]:
-    """Name -> (T+1,), the table above; what the environment does not show is left out."""
+def episode_columns(episode: Any) -> dict[str, Array]:
+    """Name -> (T+1,), the table above, of an `Episode`; what the environment does not show is left out."""
     steps, task = len(episode.rewards), episode.task
     found: dict[str, Array] = {"t": np.arange(steps + 1.0) * float(task.dt)}
     if episode.states.shape[1] == len(_STATE):

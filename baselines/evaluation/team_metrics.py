@@ -6,8 +6,7 @@ A team's number is formed first, flight by flight, and intervals are over flight
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -15,29 +14,12 @@ from quad_envs.parameters import POSITION, Array
 from quad_envs.tasks import TeamTask
 
 from .episode import Episode
-
-if TYPE_CHECKING:
-    from .record import Record
+from .record import TEAM_COLUMNS, Record
 
 FORMATION_SETTLED = 0.1  # m, distance to the slot below which a vehicle has settled
 FINAL = 1.0  # s, end of a flight over which `formation_final` is taken
 _HEIGHT = 2
 
-# Column of a vehicle's record -> unit.
-TEAM_COLUMNS = {
-    "formation_rms": "m",
-    "formation_final": "m",
-    "formation_settling": "s",
-    "min_separation": "m",
-    "z_error_max": "m",
-    "z_error_rms": "m",
-    "messages": "-",
-    "estimate_rmse": "m",
-    "estimate_sigma": "m",
-    "anees": "-",
-    "nis_ratio": "-",
-    "trilateration_share": "-",
-}
 # How a team's number comes from its vehicles'; the mean of those that have one where nothing is said.
 _LEAST, _LARGEST = ("min_separation",), ("formation_settling", "z_error_max")
 # Of these the worst vehicle is told beside the mean, as `<column>_worst`.
@@ -140,8 +122,3 @@ def _of_team(team: Sequence[Record], column: str) -> float:
 def has_team(records: Sequence[Record]) -> bool:
     """Whether records are those of teams' vehicles."""
     return any(record.agent for record in records)
-
-
-def drop_team_columns(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row without the columns that only teams have."""
-    return {name: value for name, value in row.items() if name not in TEAM_COLUMNS}

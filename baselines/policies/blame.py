@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-_HOME = Path(__file__).resolve().parents[1]
+_HOME = Path(__file__).resolve().parents[2]
 _OURS = tuple(str(_HOME / package) for package in ("quad_envs", "controllers", "baselines"))
 _INSTALLED = ("site-packages", "dist-packages")  # folders of other people's packages
 

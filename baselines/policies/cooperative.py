@@ -252,7 +252,7 @@ def make_cooperative_mpc(
 
     Options are those of `controllers.team.cooperative.CooperativeMpc` (reach is 2 m: the target is far at the
     start), and three more. `estimator` is "ekf" (None), "trilateration", "polar-ekf", "random-walk" or an
-    object of the user's, and `q` belongs to it, see `baselines.policies.estimation.make_estimator`; None: 0.02 for
+    object of the user's, and `q` belongs to it, see `estimation.make_estimator`; None: 0.02 for
     estimation, 0.05 m^2/s^3 for tracking. `estimates` is "own", a filter per agent in `state`, or "shared",
     what `EstimateWrapper` put into the observation; None: shared where it is there.
 

@@ -61,7 +61,7 @@ class EstimateWrapper(BaseParallelWrapper):  # type: ignore[misc]
         env: A ParallelEnv of this suite with a target.
         fusion: Weights of the covariance intersection: "trace" (1 / tr P), "equal", "determinant" (smallest
             determinant); "none": nobody tells anybody.
-        q: Of the target's motion in the filters, see `baselines.policies.estimation.make_estimator`; None: 0.02 for
+        q: Of the target's motion in the filters, see `estimation.make_estimator`; None: 0.02 for
             estimation, 0.05 m^2/s^3 for tracking.
         estimator: "ekf", "trilateration", "polar-ekf", "random-walk", or an object of the user's.
 

@@ -16,7 +16,6 @@ from .checkpoints import DESCRIPTION, save_checkpoint
 from .environments import task_of
 from .network import Features, Network, Squash, entry_names
 from .normalisation import Normalisation, read_normalisation
-from .registry import mission_of
 from .sb3_files import Actor, ModelFile
 
 _NO_CUT = 1e15  # a clip that cuts nothing
@@ -79,7 +78,7 @@ def export_policy(
     about = {"algorithm": actor.algorithm, "kind": "model-free" if actor.algorithm else ""}
     if task is not None:
         _require_actions(actor, task)
-        about |= {"env_id": task.env_id, "mission": mission_of(task)}
+        about |= {"env_id": task.env_id, "mission": task.mission}
     save_checkpoint(path, network, about)
     return path
 

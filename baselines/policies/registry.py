@@ -27,7 +27,7 @@ class PolicyEntry(NamedTuple):
     module: str
     factory: str  # name in the module: called with the task and the options
     description: str
-    missions: tuple[str, ...] = ("tracking",)  # that it serves, see `mission_of`
+    missions: tuple[str, ...] = ("tracking",)  # that it serves, see `BaseTask.mission`
     decision_ms: float = 0.05  # about, of a vehicle: sweeps fly the quick ones first, and estimate their time
     privileged: bool = False  # it sees `env.state()`: a yardstick, listed apart
 
@@ -109,11 +109,6 @@ TEAM_POLICIES: dict[str, PolicyEntry] = {
         "baselines.policies.team", "TeamRandom", "uniform random actions", TEAM_MISSIONS, decision_ms=0.0
     ),
 }
-
-
-def mission_of(task: BaseTask) -> str:
-    """What policies of a task do: "tracking", "formation", "target-tracking" or "estimation"."""
-    return str(getattr(task, "mission", "tracking"))
 
 
 def serving(mission: str) -> dict[str, PolicyEntry]:
@@ -245,8 +240,8 @@ def make_policy(name: str | os.PathLike[str] | Any, env: Any, **options: Any) ->
         _check_kind(name, known[option], value)
     defaults = policy_options(name)
     task: BaseTask = task_of(env)
-    factory = _factory(policy_entry(name, mission_of(task)))
-    if mission_of(task) in TEAM_MISSIONS:
+    factory = _factory(policy_entry(name, task.mission))
+    if task.mission in TEAM_MISSIONS:
         return _make_team_policy(name, factory, cast("TeamTask", task), defaults, options)
     return _make_tracking_policy(name, factory, cast("Task", task), defaults, options)
 

@@ -16,7 +16,7 @@ from ..errors import CheckpointError
 if TYPE_CHECKING:
     from .network import NetworkPolicy
 
-SHIPPED = Path(__file__).parent / "policies"  # one checkpoint per folder, as "apg-helix"
+SHIPPED = Path(__file__).parent / "shipped"  # one checkpoint per folder, as "apg-helix"
 _DESCRIPTION = "policy.json"
 
 
@@ -83,16 +83,15 @@ def load_policy(source: str | os.PathLike[str], env: Any) -> NetworkPolicy:
     from .checkpoints import load_checkpoint
     from .environments import task_of
     from .network import NetworkPolicy
-    from .registry import mission_of
 
     folder = checkpoint_folder(source)
     network, said = load_checkpoint(folder)
     task = task_of(env)
     where, mission = f"checkpoint {str(folder)!r}", said.get("mission")
-    if mission is not None and mission != mission_of(task):
+    if mission is not None and mission != task.mission:
         raise CheckpointError(
             f"{where} was trained on {shown(said.get('env_id'))}, a task of the kind {shown(mission)}; "
-            f"{task.env_id} is one of {mission_of(task)}: train one for it with quad-envs train {task.env_id}"
+            f"{task.env_id} is one of {task.mission}: train one for it with quad-envs train {task.env_id}"
         )
     name = os.fspath(source) if folder.parent == SHIPPED else folder.name or str(folder)
     try:

@@ -6,20 +6,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ..sweeps.folder import Run, read_run
     from .build import Choice, build_report, render_report
     from .page import render_page
 
 _PUBLIC = {
     "Choice": "build",
-    "Run": "folder",
     "build_report": "build",
-    "read_run": "folder",
     "render_page": "page",
     "render_report": "build",
 }
 
-__all__ = ["Choice", "Run", "build_report", "read_run", "render_page", "render_report"]
+__all__ = ["Choice", "build_report", "render_page", "render_report"]
 
 
 def __getattr__(name: str) -> Any:

@@ -18,7 +18,7 @@ from baselines.sweeps.comparison import Results
 from baselines.sweeps.suite import EnvChoice, Suite
 from baselines.sweeps.units import Unit, suite_units
 from quad_envs.constraints import TOLERANCE
-from quad_envs.tasks import BaseTask, TeamTask
+from quad_envs.tasks import BaseTask
 
 
 class Finished(NamedTuple):
@@ -72,7 +72,7 @@ def task_facts(task: BaseTask) -> dict[str, Any]:
         "hover_force": task.hover_force,
         "rotors": (task.params.rotor_positions() / task.params.arm).tolist(),
         "tolerance": TOLERANCE,
-        "mission": task.mission if isinstance(task, TeamTask) else "tracking",
+        "mission": task.mission,
     }
     plain: dict[str, Any] = plain_json(facts | derived)
     return plain

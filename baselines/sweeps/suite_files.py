@@ -180,7 +180,7 @@ def _names(value: Any, who: str, suite: str) -> tuple[str, ...]:
 
 def suite_names() -> dict[str, str]:
     """Shipped suites and what they are."""
-    files = sorted(resources.files("baselines").joinpath("suites").iterdir(), key=lambda file: file.name)
+    files = sorted(resources.files(__package__).joinpath("suites").iterdir(), key=lambda file: file.name)
     toml = [file for file in files if file.name.endswith(".toml")]
     return {
         file.name[:-5]: str(tomllib.loads(file.read_text("utf-8")).get("description", "")) for file in toml
@@ -206,7 +206,7 @@ def load_suite(source: str | Path | Mapping[str, Any] | Suite) -> Suite:
         return _read_suite(path)
     if str(source) not in suite_names():
         raise ValueError(unknown_name("suite", str(source), suite_names()) + "; or the path of a .toml file")
-    text = resources.files("baselines").joinpath("suites", f"{source}.toml").read_text("utf-8")
+    text = resources.files(__package__).joinpath("suites", f"{source}.toml").read_text("utf-8")
     return suite_from_dict(tomllib.loads(text), path.stem)
 
 

@@ -18,16 +18,13 @@ from ..files import (
     read_json,
     refuse_foreign,
     source_digest,
-    write_atomic,
     write_csv,
     write_json,
 )
 from ..policies.registry import from_outside
-from ..report import render_report
 from .comparison import Failure, Results
 from .engines import run_units
 from .finished import train_unit
-from .folder import read_run
 from .stages import price
 from .suite import Suite
 from .unit_flights import fly_unit
@@ -136,7 +133,7 @@ class Sweep:
         return len(self.trained) + len(self.flown) + len(self.failed)
 
     def finish(self) -> Results:
-        """What was found; the tables and the report of it are written."""
+        """What was found; its tables are written."""
         flown = [unit for unit in self.units if unit.number in self.flown]
         failures = tuple(
             Failure(unit.env.title, unit.policy.title, self.failed[unit.number])
@@ -153,7 +150,6 @@ class Sweep:
         )
         if self.folder is not None:
             _write_tables(self.folder, results)
-            write_atomic(self.folder / "report.html", render_report(read_run(self.folder)).encode())
         return results
 
 

@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 # Public name -> module; loaded at first use, so that evaluating a network loads no torch.
 _PUBLIC = {
-    "Features": "networks",
-    "Network": "networks",
-    "NetworkPolicy": "networks",
-    "load_checkpoint": "checkpoints",
-    "save_checkpoint": "checkpoints",
+    "Features": "baselines.policies.network",
+    "Network": "baselines.policies.network",
+    "NetworkPolicy": "baselines.policies.network",
+    "load_checkpoint": "baselines.policies.checkpoints",
+    "save_checkpoint": "baselines.policies.checkpoints",
 }
 
 __all__ = ["Features", "Network", "NetworkPolicy", "load_checkpoint", "save_checkpoint"]
@@ -28,5 +28,5 @@ __all__ = ["Features", "Network", "NetworkPolicy", "load_checkpoint", "save_chec
 
 def __getattr__(name: str) -> Any:
     if name in _PUBLIC:
-        return getattr(import_module(f".{_PUBLIC[name]}", __name__), name)
+        return getattr(import_module(_PUBLIC[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

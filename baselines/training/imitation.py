@@ -24,7 +24,7 @@ from ..errors import TrainingError
 from ..evaluation.rollout import is_privileged
 from ..policies.network import Floats, Network, NetworkPolicy, hover_outputs
 from ..policies.protocol import Policy
-from ..policies.registry import make_policy, mission_of
+from ..policies.registry import make_policy
 from .algorithm_options import DaggerOptions
 from .features import training_features
 from .held_out import Progress
@@ -142,7 +142,7 @@ def make_expert(name: str, task: BaseTask, separation: float | None = None) -> P
     Raises:
         ValueError: If it is unknown, sees more than observations, or remembers what a network cannot.
     """
-    mission = mission_of(task)
+    mission = task.mission
     if not name and mission not in _EXPERTS:
         raise ValueError(
             f"dagger has no expert for {mission} tasks: what cooperative-mpc knows of the target is in its "

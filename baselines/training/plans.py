@@ -12,7 +12,6 @@ from quad_envs.names import shown
 from ..errors import ResultsError
 from ..policies.checkpoints import load_checkpoint
 from ..policies.network import Network
-from ..policies.registry import mission_of
 from ..policies.trained import checkpoint_folder
 from .algorithm_options import check_sizes
 from .algorithms import algorithm_for, require_packages, require_resumable
@@ -81,7 +80,7 @@ def make_plan(
         )
     kwargs = dict(env_kwargs or {})
     task_options = training_options(env_id, kwargs)
-    mission = mission_of(task_options.task)
+    mission = task_options.task.mission
     entry = algorithm_for(algorithm, mission)
     budget = Budget(entry.seconds if seconds is None and steps is None else seconds, steps)
     require_packages(algorithm)

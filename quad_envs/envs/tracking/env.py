@@ -39,7 +39,7 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
     (`info["clipped_actions"]`).
 
     ## Observation Space
-    One flat float32 Box, see `quad_envs.observations.tracking`: `env.unwrapped.task.layout.slices` names the parts and
+    One flat float32 Box, see `quad_envs.observations`: `env.unwrapped.task.layout.slices` names the parts and
     `layout.decode` takes them apart. It holds the vehicle's own state, the last command and the coming
     reference relative to the vehicle.
 
