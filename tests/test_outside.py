@@ -325,6 +325,12 @@ def test_a_sweep_of_nothing_but_broken_policies_is_refused(theirs, folder):
 
 
 def test_policies_travel_to_other_processes(theirs, folder):
+    """To those too that began before the user's folder was importable: joblib keeps them for a while."""
+    from joblib import Parallel, delayed
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "path", [place for place in sys.path if place not in ("", str(folder))])
+        Parallel(n_jobs=2)(delayed(abs)(number) for number in range(4))
     results = run_benchmark(
         {**SMALL, "episodes": 1}, policies={"mine": theirs.Even, "by name": "their_policy:make"}, jobs=2
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from importlib import import_module
@@ -54,14 +56,22 @@ def _with_number(work: Callable[[Unit], dict[str, Any]], unit: Unit) -> tuple[in
     return unit.number, work(unit)  # type: ignore[attr-defined]
 
 
+def _found_again(path: list[str], payload: bytes) -> tuple[int, dict[str, Any]]:
+    """`_with_number` in a process that may have begun before the user's modules could be found."""
+    sys.path += [place for place in path if place not in sys.path]
+    work, unit = pickle.loads(payload)
+    return _with_number(work, unit)
+
+
 def _run_parallel(
     work: Callable[[Unit], dict[str, Any]], units: Sequence[Unit], engine: str, jobs: int
 ) -> Iterator[tuple[int, dict[str, Any]]]:
     import joblib
+    from cloudpickle import dumps
 
     with ExitStack() as stack:
         stack.enter_context(joblib.parallel_config(backend=_start(engine, jobs, stack), n_jobs=jobs))
-        tasks = [joblib.delayed(_with_number)(work, unit) for unit in units]
+        tasks = [joblib.delayed(_found_again)(sys.path, dumps((work, unit))) for unit in units]
         try:
             results = joblib.Parallel(return_as="generator_unordered", batch_size=1)(tasks)
         except (
