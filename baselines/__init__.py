@@ -9,9 +9,9 @@ from quad_envs.lazy import load_public, public_names
 if TYPE_CHECKING:
     from .benchmark import run_benchmark
     from .errors import CheckpointError, PolicyCheckError, PolicyError, ResultsError, TrainingError
+    from .evaluation.columns import Record
     from .evaluation.evaluate import Evaluation
     from .evaluation.metrics import Estimate, estimate, measure, paired_difference
-    from .evaluation.record import Record
     from .evaluation.rollout import Episode, run_episodes
     from .policies.conformance import check_policy
     from .policies.estimate_wrapper import EstimateWrapper
@@ -38,7 +38,7 @@ _PUBLIC = {
     "PolicyCheckError": "errors",
     "PolicyError": "errors",
     "PolicyState": "policies.protocol",
-    "Record": "evaluation.record",
+    "Record": "evaluation.columns",
     "Results": "sweeps.comparison",
     "ResultsError": "errors",
     "Suite": "sweeps.suite",

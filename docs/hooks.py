@@ -1,7 +1,8 @@
 """What MkDocs does to each page beyond its plugins, so that the site loads nothing from elsewhere.
 
 Equations become MathML when the site is built: `pymdownx.arithmatex` has marked them, their TeX escaped as
-HTML. And the one script that the theme would take from the network is the copy in docs/vendor.
+HTML. The one script that the theme would take from the network is the copy in docs/vendor. And the table of
+the columns that evaluations have is written from `baselines.evaluation.columns`.
 """
 
 from __future__ import annotations
@@ -10,9 +11,34 @@ import html
 import re
 from typing import Any
 
+COLUMNS_HERE = "<!-- table: columns -->"
 _INLINE = re.compile(r'<span class="arithmatex">\\\((.*?)\\\)</span>', re.DOTALL)
 _DISPLAY = re.compile(r'<div class="arithmatex">\\\[(.*?)\\\]</div>', re.DOTALL)
 _SHIM, _OWN_SHIM = "https://unpkg.com/iframe-worker/shim", "vendor/iframe-worker.js"
+
+
+def columns_table() -> str:
+    """The columns of the tables of evaluations, as Markdown."""
+    from baselines.evaluation.column import CUT_SHORT, SINGLE, TEAM, WORST
+    from baselines.evaluation.columns import COLUMNS
+
+    lines = ["| column | on the page | unit | |", "|---|---|---|---|"]
+    for name, column in COLUMNS.items():
+        notes = [
+            column.about.replace("|", r"\|"),
+            *["empty after a crash"] * column.has(CUT_SHORT),
+            *["teams only"] * column.has(TEAM),
+            *["not in tables of teams"] * column.has(SINGLE),
+            *[f"`{column.worst().name}` is that of the worst vehicle"] * column.has(WORST),
+        ]
+        if column.source in ("", name):
+            lines.append(f"| `{name}` | {column.title} | {column.unit} | {'; '.join(notes)} |")
+    return "\n".join(lines)
+
+
+def on_page_markdown(markdown: str, **kwargs: Any) -> str:
+    """The page with its table of columns, where it has one."""
+    return markdown.replace(COLUMNS_HERE, columns_table()) if COLUMNS_HERE in markdown else markdown
 
 
 def to_mathml(tex: str, display: str) -> str:

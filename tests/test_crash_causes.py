@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from baselines import evaluate, make_policy, measure, run_episodes
+from baselines.evaluation.columns import Record
 from baselines.evaluation.metrics import crash_causes
-from baselines.evaluation.record import Record
 from quad_envs import formation_v0
 
 HOVER = np.zeros(4, np.float32)

@@ -114,7 +114,7 @@ def test_the_leaderboard_has_the_numbers_of_the_summary_with_their_intervals(fin
             expected = summary[row.policy][column], summary[row.policy][f"{column}_ci"]
             assert row.cells[column] == pytest.approx(expected, rel=1e-6, nan_ok=True)
     crashed = next(row for row in env.rows if row.policy == EVIL)
-    assert crashed.cells["crashed"][0] == 3 and crashed.cells["cost"] == (None, None)
+    assert crashed.cells["crashed"][0] == 3 and crashed.cells["quadratic_cost"] == (None, None)
 
 
 def test_no_name_can_leave_its_place_in_the_page(finished):

@@ -215,4 +215,4 @@ def test_an_evaluation_as_json_has_no_nan():
 
     found = evaluate(make_policy("random", HELIX), HELIX, episodes=2).to_dict()
     text = json.dumps(found, allow_nan=False)
-    assert json.loads(text)["summary"]["cost"]["mean"] is None
+    assert json.loads(text)["summary"]["quadratic_cost"]["mean"] is None

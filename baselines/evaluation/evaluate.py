@@ -16,9 +16,9 @@ from ..policies.environments import make_env
 from ..policies.outside import is_policy
 from ..policies.protocol import Policy
 from ..policies.registry import make_policy, policy_name
+from .column import CUT_SHORT
+from .columns import COLUMNS, Record, read_record
 from .metrics import (
-    AVERAGED,
-    CUT_SHORT,
     Estimate,
     crash_causes,
     decision_quantiles,
@@ -28,22 +28,10 @@ from .metrics import (
     totals,
     worst_violations,
 )
-from .record import TEAM_COLUMNS, Record
 from .rollout import Episode, is_privileged, run_episodes
 from .table import Table, format_number
-from .team_metrics import TEAM_CUT_SHORT, by_flight, flight_values, has_team
+from .team_metrics import by_flight, flight_values, has_team
 
-_UNITS = {
-    "score": "-",
-    "cost": "-",
-    "position_rms": "m",
-    "steady_rms": "m",
-    "effort": "N^2",
-    "settling_time": "s",
-    "violation_share": "-",
-    "saturation_share": "-",
-    **TEAM_COLUMNS,
-}
 _NOT_TIMED = (math.nan, math.nan, math.nan)
 NO_SPANNING_TREE = (
     "no spanning tree: from the leader, or from those who measure, news does not reach every vehicle, "
@@ -130,11 +118,8 @@ class Evaluation:
         def read(value: Any) -> Any:
             return math.nan if value is None else value
 
-        records = (
-            Record(**{key: read(value) for key, value in record.items()}) for record in plain["records"]
-        )
         times = {name: tuple(map(read, plain[name])) for name in ("decision_ms", "team_ms")}
-        return cls(**{**plain, **times, "records": tuple(records)})
+        return cls(**{**plain, **times, "records": tuple(map(read_record, plain["records"]))})
 
     def __str__(self) -> str:
         return str(self._table())
@@ -152,8 +137,7 @@ class Evaluation:
             finite = [number for number in found.values() if math.isfinite(number)]
             spread = (min(finite), max(finite)) if math.isfinite(value.mean) else (math.nan, math.nan)
             cells = [value.mean, value.half_width, *spread]
-            unit = _UNITS[name.removesuffix("_worst")]
-            rows.append([name, unit, *map(format_number, cells), str(value.n)])
+            rows.append([name, COLUMNS[name].unit or "-", *map(format_number, cells), str(value.n)])
         counts = totals(self.records).items()
         counted = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counts)
         of_team = f" of {self.vehicles} vehicles" if has_team(self.records) else ""
@@ -174,8 +158,8 @@ class Evaluation:
     def _tells(self, name: str, values: Iterable[float]) -> bool:
         """Whether a column has anything to say: a number, or that a crash left none."""
         if not has_team(self.records):
-            return name in AVERAGED
-        lost = name in (*CUT_SHORT, *TEAM_CUT_SHORT) and not name.startswith("estimate")
+            return True
+        lost = COLUMNS[name].has(CUT_SHORT) and not name.startswith("estimate")
         return any(map(math.isfinite, values)) or (lost and any(record.crashed for record in self.records))
 
 

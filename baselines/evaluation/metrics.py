@@ -20,29 +20,14 @@ from quad_envs.constraints import TOLERANCE
 from quad_envs.parameters import POSITION, Array
 from quad_envs.tasks import TeamTask
 
+from .column import COUNTED, CUT_SHORT, FALLBACK
+from .columns import COLUMNS, Record, averaged, without_cut_short
 from .episode import Episode
-from .record import Record
-from .team_metrics import TEAM_CUT_SHORT, TEAM_SUMMARY, by_flight, flight_values, has_team, measure_team
+from .team_metrics import by_flight, flight_values, has_team, measure_team
 
 SETTLED = 0.05  # share of the initial position error below which the vehicle has settled
 SETTLING_LEAST = 0.1  # m, initial position error from which settling means anything
 SATURATED = 1e-6  # N, distance from a face of the rotor box that counts as on it
-
-
-# Columns that `summarize` averages; the rest are counted or taken at their worst.
-AVERAGED = (
-    "score",
-    "cost",
-    "position_rms",
-    "steady_rms",
-    "effort",
-    "settling_time",
-    "violation_share",
-    "saturation_share",
-)
-# Columns that are nan after a crash, and therefore not averaged over what is left.
-CUT_SHORT = ("cost", "position_rms", "steady_rms", "settling_time")
-COUNTED = ("crashed", "relaxed", "previous_plan", "clipped_sdre", "hover", "left_model")
 
 
 def measure(episode: Episode) -> Record:
@@ -57,15 +42,16 @@ def measure(episode: Episode) -> Record:
     excess = np.maximum(episode.constraint_values, 0.0).max(axis=0, initial=0.0)
     excess[excess <= TOLERANCE] = 0.0  # as the environments count violations
     p50, p99, slowest = decision_quantiles(episode.decision_times)
-    return Record(
+    record = Record(
         seed=episode.seed,
         steps=steps,
         score=float(bounded.sum()) / task.episode_steps,
-        cost=float("nan") if episode.crashed else float(episode.stage_costs.sum()),
-        position_rms=float("nan") if episode.crashed else _rms(error),
-        steady_rms=float("nan") if episode.crashed else _rms(error[task.episode_steps // 2 :]),
+        quadratic_cost=float(episode.stage_costs.sum()),
+        constraint_cost=float(episode.costs.sum()),
+        position_rms=_rms(error),
+        steady_rms=_rms(error[task.episode_steps // 2 :]),
         effort=float((du * du).sum(axis=1).mean()),
-        settling_time=_settling_time(error, task.dt) if not episode.crashed else float("nan"),
+        settling_time=_settling_time(error, task.dt),
         violation_share=float(episode.violations.mean()),
         crashed=episode.crashed,
         saturation_share=_saturation_share(episode.commands, task.force_max),
@@ -83,6 +69,7 @@ def measure(episode: Episode) -> Record:
         left_model=episode.left_model,
         **measure_team(episode),
     )
+    return without_cut_short(record) if episode.crashed else record
 
 
 def _position_error(episode: Episode) -> Array:
@@ -156,19 +143,20 @@ def paired_difference(ours: Sequence[Record], theirs: Sequence[Record], column: 
     Args:
         ours: Records of one policy.
         theirs: Records of another in the same environment.
-        column: One of AVERAGED, or of TEAM_SUMMARY.
+        column: One that `summarize` averages.
 
     Raises:
         ValueError: If the column is not averaged, or no seed is in both.
     """
-    if column not in (*AVERAGED, *TEAM_SUMMARY):
-        raise ValueError(f"column must be one of {', '.join((*AVERAGED, *TEAM_SUMMARY))}, got {column!r}")
+    names = [entry.name for entry in averaged(team=True)]
+    if column not in names:
+        raise ValueError(f"column must be one of {', '.join(names)}, got {column!r}")
     one, other = flight_values(ours, column), flight_values(theirs, column)
     seeds = dict.fromkeys(seed for seed in one if seed in other)
     if not seeds:
         raise ValueError("paired_difference needs flights with the same seeds, and these have none in common")
     crashed = any(record.crashed for record in (*ours, *theirs) if record.seed in seeds)
-    if column in (*CUT_SHORT, *TEAM_CUT_SHORT) and crashed:
+    if crashed and COLUMNS[column].has(CUT_SHORT):
         return _NO_ESTIMATE
     return estimate(one[seed] - other[seed] for seed in seeds)
 
@@ -179,18 +167,18 @@ def summarize(records: Sequence[Record]) -> dict[str, Estimate]:
     Those of CUT_SHORT are nan if a flight crashed.
     """
     crashed = any(record.crashed for record in records)
-    names = (*AVERAGED, *TEAM_SUMMARY) if has_team(records) else AVERAGED
     return {
-        name: _NO_ESTIMATE
-        if crashed and name in (*CUT_SHORT, *TEAM_CUT_SHORT)
-        else estimate(flight_values(records, name).values())
-        for name in names
+        column.name: _NO_ESTIMATE
+        if crashed and column.has(CUT_SHORT)
+        else estimate(flight_values(records, column.name).values())
+        for column in averaged(has_team(records))
     }
 
 
 def totals(records: Sequence[Record]) -> dict[str, int]:
     """Column -> sum, for every counted column; of crashes the flights, however many vehicles crash."""
-    counts = {name: int(sum(getattr(record, name) for record in records)) for name in COUNTED}
+    names = [column.source for column in COLUMNS.values() if column.source and column.has(COUNTED | FALLBACK)]
+    counts = {name: int(sum(getattr(record, name) for record in records)) for name in names}
     crashed = sum(any(record.crashed for record in team) for team in by_flight(records).values())
     return counts | {"crashed": crashed}
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from .column import COUNTED, Column
 
 
 def format_number(value: float, digits: int = 4) -> str:
@@ -62,3 +64,37 @@ class Table(NamedTuple):
             f"<div><strong>{html.escape(self.before[0])}</strong></div>{above}"
             f"<table><thead><tr>{cells('th', self.header)}</tr></thead><tbody>{body}</tbody></table>{below}"
         )
+
+
+def printed_table(
+    rows: Sequence[Mapping[str, Any]], columns: Sequence[Column], base: str, *, drop_empty: bool = False
+) -> Table:
+    """Columns of rows as they are printed, with nothing above and below.
+
+    A number with an interval, `<name>_low` and `<name>_high`, has it in brackets.
+
+    Args:
+        rows: Column name -> number, all rows of the same columns.
+        columns: That may stand in it; those without a printed heading, or that no row has, do not.
+        base: Title of the policy of the differences.
+        drop_empty: Whether to leave out columns without any number, which mean nothing here.
+    """
+    kept = [
+        column
+        for column in columns
+        if column.printed
+        and column.name in rows[0]
+        and not (drop_empty and not any(math.isfinite(row[column.name]) for row in rows))
+    ]
+    header = [column.heading.format(base=base) for column in kept]
+    return Table((), header, [[_cell(row, column) for column in kept] for row in rows])
+
+
+def _cell(row: Mapping[str, Any], column: Column) -> str:
+    value, low = row[column.name], f"{column.name}_low"
+    if column.has(COUNTED):
+        return str(value)
+    text = format_number(column.factor * value)
+    if low not in row or not math.isfinite(value):
+        return text
+    return f"{text} [{format_number(row[low], 3)}, {format_number(row[f'{column.name}_high'], 3)}]"

@@ -13,39 +13,24 @@ import numpy as np
 from quad_envs.parameters import POSITION, Array
 from quad_envs.tasks import TeamTask
 
+from .column import TEAM
+from .columns import COLUMNS, Record
 from .episode import Episode
-from .record import TEAM_COLUMNS, Record
 
 FORMATION_SETTLED = 0.1  # m, distance to the slot below which a vehicle has settled
 FINAL = 1.0  # s, end of a flight over which `formation_final` is taken
 _HEIGHT = 2
 
-# How a team's number comes from its vehicles'; the mean of those that have one where nothing is said.
-_LEAST, _LARGEST = ("min_separation",), ("formation_settling", "z_error_max")
-# Of these the worst vehicle is told beside the mean, as `<column>_worst`.
-WITH_WORST = ("formation_rms", "formation_final", "estimate_rmse")
-TEAM_SUMMARY = tuple(
-    name for column in TEAM_COLUMNS for name in (column, *[f"{column}_worst"] * (column in WITH_WORST))
-)
-# Columns that are nan after a crash.
-TEAM_CUT_SHORT = (
-    *("formation_rms", "formation_rms_worst", "formation_final", "formation_final_worst"),
-    *("formation_settling", "z_error_max", "z_error_rms"),
-    *("estimate_rmse", "estimate_rmse_worst", "estimate_sigma"),
-)
-
 
 def measure_team(episode: Episode) -> dict[str, float]:
-    """The columns TEAM_COLUMNS of one vehicle's flight; nan where they mean nothing."""
-    found = dict.fromkeys(TEAM_COLUMNS, float("nan"))
+    """The columns that only a team's vehicle has; nan where they mean nothing."""
+    found = {column.source: float("nan") for column in COLUMNS.values() if column.has(TEAM) and column.source}
     if not isinstance(episode.task, TeamTask):
         return found
     found["messages"] = float(episode.signals["messages"].mean())
     found |= _estimates(episode)
     if episode.task.mission != "estimation":
         found |= _formation(episode)
-    if episode.crashed:
-        found |= {name: float("nan") for name in TEAM_CUT_SHORT if name in found}
     return found
 
 
@@ -106,17 +91,11 @@ def by_flight(records: Sequence[Record]) -> dict[int, list[Record]]:
 
 def flight_values(records: Sequence[Record], column: str) -> dict[int, float]:
     """Seed -> the number of the whole flight, from those of its vehicles."""
-    return {seed: _of_team(team, column) for seed, team in by_flight(records).items()}
-
-
-def _of_team(team: Sequence[Record], column: str) -> float:
-    values = np.array([getattr(record, column.removesuffix("_worst")) for record in team], dtype=np.float64)
-    if column in _LEAST:
-        return float(values.min())
-    if column in _LARGEST or column.endswith("_worst"):
-        return float(values.max())
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if finite.size else float("nan")
+    about = COLUMNS[column]
+    return {
+        seed: about.of_team([getattr(record, about.source) for record in team])
+        for seed, team in by_flight(records).items()
+    }
 
 
 def has_team(records: Sequence[Record]) -> bool:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from baselines.evaluation.record import Record
+from baselines.evaluation.columns import Record
 from quad_envs.parameters import ATTITUDE, FORCES, POSITION, Array
 
 from .model import Flight

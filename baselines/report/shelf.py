@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from baselines.evaluation.record import Record
+from baselines.evaluation.columns import Record
 
 from ..sweeps.folder import Finished
 from .flights import BadFlightError, read_flight

@@ -14,8 +14,8 @@ from joblib import Parallel, delayed
 from quad_envs.parameters import Array
 from quad_envs.references import Helix, OutAndBack, Reference, SetPoint, SphericalSpiral
 
+from ..evaluation.columns import Record
 from ..evaluation.metrics import measure
-from ..evaluation.record import Record
 from ..evaluation.rollout import Episode, run_episodes
 from ..policies.registry import make_policy
 

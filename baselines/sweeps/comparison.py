@@ -3,51 +3,21 @@
 from __future__ import annotations
 
 import html
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from ..evaluation.column import COMPARED, Column
+from ..evaluation.columns import COLUMNS, fallbacks, limits_in, shown
 from ..evaluation.evaluate import NO_SPANNING_TREE, Evaluation
 from ..evaluation.metrics import paired_difference, said_causes, totals, worst_violations
-from ..evaluation.table import Table, format_number
+from ..evaluation.table import Table, printed_table
 from ..files import plain_json
 from .contenders import contender_rows, contender_tables, find_contenders
 from .suite import EnvChoice, Suite
 from .units import Unit, suite_units
 
-COMPARED = ("score", "cost", "position_rms", "effort")  # columns with paired differences
-COMPARED_TEAM = ("formation_rms", "min_separation", "estimate_rmse")  # and of a team
-_FAILED = ("relaxed", "previous_plan", "clipped_sdre", "hover")
-# Columns of the printed table: title, key of the summary row, factor. Where they end stand the limits.
-_COLUMNS = (
-    ("score", "score", 1.0),
-    ("- {base}", "score_minus_base", 1.0),
-    ("+-", "score_minus_base_ci", 1.0),
-    ("cost", "cost", 1.0),
-    ("RMS m", "position_rms", 1.0),
-    ("steady m", "steady_rms", 1.0),
-    ("effort N^2", "effort", 1.0),
-    ("violating %", "violation_share", 100.0),
-)
-_TEAM_COLUMNS = (
-    ("final m", "formation_final", 1.0),
-    ("worst m", "formation_final_worst", 1.0),
-    ("settling s", "formation_settling", 1.0),
-    ("separation m", "min_separation", 1.0),
-    ("z max m", "z_error_max", 1.0),
-    ("estimate m", "estimate_rmse", 1.0),
-    ("worst m", "estimate_rmse_worst", 1.0),
-    ("ANEES", "anees", 1.0),
-    ("NIS", "nis_ratio", 1.0),
-)
-_LAST_COLUMNS = (
-    ("saturated %", "saturation_share", 100.0),
-    ("p50 ms", "decision_p50_ms", 1.0),
-    ("p99 ms", "decision_p99_ms", 1.0),
-    ("team p50 ms", "team_p50_ms", 1.0),
-    ("team p99 ms", "team_p99_ms", 1.0),
-)
+_INTERVAL = Column("", "", "half width of its 95 % interval", printed="+-", name="score_minus_base_ci")
 
 
 class Failure(NamedTuple):
@@ -111,8 +81,8 @@ class Results:
         summary = ours.summary()
         for name, value in summary.items():
             row[name], row[f"{name}_ci"] = value.mean, value.half_width
-        for name in (*COMPARED, *COMPARED_TEAM):
-            if name in summary:
+        for name in summary:
+            if COLUMNS[name].has(COMPARED):
                 difference = paired_difference(ours.records, base.records, name)
                 row[f"{name}_minus_base"], row[f"{name}_minus_base_ci"] = (
                     difference.mean,
@@ -161,33 +131,17 @@ class Results:
         return [self._table(env) for env in envs if env.title in flown]
 
     def _table(self, env: EnvChoice) -> Table:
-        rows = [row for row in self.summary() if row["env"] == env.title]
-        limits = [key for key in rows[0] if key.startswith("worst_")]  # differ in unit, so never merged
-        before, after, team = list(_COLUMNS), list(_LAST_COLUMNS), "vehicles" in rows[0]
-        if team:
-            before[4:6] = _TEAM_COLUMNS
-        before += [(key.replace("_", " "), key, 1.0) for key in limits]
-        if not team:
-            after = [column for column in after if column[1] in rows[0]]
-        else:  # what means nothing here is nan in every row
-            before, after = (
-                [column for column in columns if any(math.isfinite(row[column[1]]) for row in rows)]
-                for columns in (before, after)
-            )
-        titles = [
-            [title.format(base=self.base_of(env.title)) for title, *_ in part] for part in (before, after)
-        ]
-        lines = []
-        for row in rows:
-            first, last = ([format_number(f * row[key]) for _, key, f in part] for part in (before, after))
-            name = row["policy"] + (" (privileged)" if row.get("privileged") else "")
-            failed = sum(row[name] for name in _FAILED)
-            counts = str(failed), str(row["left_model"])
-            lines.append([name, *first, str(row["crashed"]), *last, *counts])
-        header = ["policy", *titles[0], "crashes", *titles[1], "fallbacks", "left model"]
+        rows = [{**row, "fallbacks": fallbacks(row)} for row in self.summary() if row["env"] == env.title]
+        team = "vehicles" in rows[0]
+        columns: list[Column] = []
+        for column in shown(team, limits_in(rows[0])):
+            columns += (column, column.difference(), _INTERVAL) if column.name == "score" else (column,)
+        table = printed_table(rows, columns, self.base_of(env.title), drop_empty=team)
+        names = [row["policy"] + (" (privileged)" if row.get("privileged") else "") for row in rows]
+        lines = [[name, *cells] for name, cells in zip(names, table.rows, strict=True)]
         seeds = f"seeds {self.suite.seed} to {self.suite.seed + self.suite.episodes - 1}"
         notes = () if rows[0].get("spanning_tree", True) else (f"note: {NO_SPANNING_TREE}",)
-        return Table((f"{env.title}, {seeds}", *notes), header, lines)
+        return Table((f"{env.title}, {seeds}", *notes), ["policy", *table.header], lines)
 
 
 def _timed(what: str, quantiles: tuple[float, float, float]) -> dict[str, float]:

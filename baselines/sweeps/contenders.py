@@ -14,10 +14,12 @@ import numpy as np
 
 from quad_envs.parameters import Array
 
+from ..evaluation.column import COUNTED, LESS, MORE, TEAM, Column
+from ..evaluation.columns import COLUMNS, limits_in, shown
 from ..evaluation.evaluate import Evaluation
 from ..evaluation.metrics import summarize, totals, worst_violations
 from ..evaluation.statistics import Comparison, Interval, compare
-from ..evaluation.table import Table, format_number
+from ..evaluation.table import Table, printed_table
 from ..evaluation.team_metrics import flight_values
 from ..policies.registry import from_outside
 from ..training.algorithms import ALGORITHMS
@@ -25,7 +27,35 @@ from .suite import PolicyChoice, Suite, is_for
 from .units import Unit, training_units
 
 ALL = "all environments"
-_MEANS = ("cost", "position_rms", "steady_rms", "effort", "violation_share", "saturation_share")
+_COST = COLUMNS["quadratic_cost"].difference()
+# Columns beyond those of summaries: of the score, with intervals, and of training.
+SEEDS = Column("Seeds", "", "of the training", COUNTED, name="seeds")
+SCORES = {
+    column.name: column
+    for column in (
+        Column("IQM", "", "interquartile mean of the score", MORE, "IQM", "iqm"),
+        COLUMNS["score"].difference(),
+        Column(
+            *("P(better)", "", "probability to score more than {base} on a start", MORE),
+            printed="P(better)",
+            name="improvement",
+        ),
+    )
+}
+TRAININGS = {
+    column.name: column
+    for column in (
+        Column(
+            "Training",
+            "CPU-s",
+            "CPU time of one training, mean of the seeds",
+            LESS,
+            "train",
+            "training_cpu_s",
+        ),
+        Column("Training", "steps", "environment steps of one training", LESS, "train", "training_steps"),
+    )
+}
 
 
 class Contender(NamedTuple):
@@ -49,7 +79,7 @@ class Contender(NamedTuple):
             "kind": self.kind,
             "seeds": len(self.evaluations),
             "flights": sum(one.flights for one in self.evaluations),
-            **{name: float(np.mean([means[name] for means in seeds])) for name in ("score", *_MEANS)},
+            **{name: float(np.mean([means[name] for means in seeds])) for name in seeds[0]},
             "crashed": sum(totals(one.records)["crashed"] for one in self.evaluations),
             **{f"worst_{name}": value for name, value in worst_violations(records).items()},
         }
@@ -130,8 +160,8 @@ def contender_rows(contenders: Sequence[Contender], base: str) -> list[dict[str,
         rivals = [other for other in contenders if other[:2] == one[:2]]
         rival = next((other for other in rivals if other.name == base), rivals[0])
         row |= {"base": rival.name} | _compared(one.beside(rival))
-        cost = one.beside(rival, "cost")
-        row |= _spread("cost_minus_base", None if cost is None else cost.difference)
+        cost = one.beside(rival, "quadratic_cost")
+        row |= _spread(_COST.name, None if cost is None else cost.difference)
         rows.append(row)
     return rows + list(_over_all(contenders, base))
 
@@ -173,28 +203,6 @@ def _spread(name: str, interval: Interval | None) -> dict[str, float]:
     return {name: value, f"{name}_low": low, f"{name}_high": high}
 
 
-# Columns of the printed table: title, key, factor. Where they end stand the limits.
-_COLUMNS = (
-    ("score", "score", 1.0),
-    ("IQM", "iqm", 1.0),
-    ("- {base}", "score_minus_base", 1.0),
-    ("P(better)", "improvement", 1.0),
-    ("cost", "cost", 1.0),
-    ("- {base}", "cost_minus_base", 1.0),
-    ("RMS m", "position_rms", 1.0),
-    ("steady m", "steady_rms", 1.0),
-    ("effort N^2", "effort", 1.0),
-    ("violating %", "violation_share", 100.0),
-)
-_LAST_COLUMNS = (
-    ("saturated %", "saturation_share", 100.0),
-    ("p50 ms", "decision_p50_ms", 1.0),
-    ("p99 ms", "decision_p99_ms", 1.0),
-    ("train CPU-s", "training_cpu_s", 1.0),
-    ("train steps", "training_steps", 1.0),
-)
-
-
 def contender_tables(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
     """One table per environment and condition; [low, high] are 95 % bootstrap intervals."""
     keys = dict.fromkeys((row["env"], row["condition"]) for row in rows)
@@ -202,29 +210,13 @@ def contender_tables(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    limits = [(key.replace("_", " "), key, 1.0) for key in rows[0] if key.startswith("worst_")]
-    first, last = (
-        [entry for entry in part if any(entry[1] in row for row in rows)]
-        for part in (_COLUMNS, _LAST_COLUMNS)
-    )
-    columns = [*first, *limits]
-    header = ["policy", "kind", "seeds", *(title.format(base=rows[0]["base"]) for title, *_ in columns)]
-    header += ["crashes", *(title for title, *_ in last)]
-    lines = [
-        [
-            *(row["policy"], row["kind"], str(row["seeds"])),
-            *(_cell(row, key, factor) for _, key, factor in columns),
-            str(row["crashed"]),
-            *(_cell(row, key, factor) for _, key, factor in last),
-        ]
-        for row in rows
-    ]
+    beside = {"score": tuple(SCORES.values()), "quadratic_cost": (_COST,)}
+    team = any(name in rows[0] for name, column in COLUMNS.items() if column.has(TEAM))
+    columns: list[Column] = []
+    for column in shown(team, limits_in(rows[0])):
+        columns += (column, *beside.get(column.name, ()))
+    table = printed_table(rows, [*columns, *TRAININGS.values()], rows[0]["base"], drop_empty=team)
+    names = [(row["policy"], row["kind"], str(row["seeds"])) for row in rows]
+    lines = [[*name, *cells] for name, cells in zip(names, table.rows, strict=True)]
     title = ", ".join(filter(None, (rows[0]["env"], rows[0]["condition"])))
-    return Table((title,), header, lines)
-
-
-def _cell(row: Mapping[str, Any], key: str, factor: float) -> str:
-    text = format_number(factor * row[key])
-    if f"{key}_low" not in row or not math.isfinite(row[key]):
-        return text
-    return f"{text} [{format_number(row[f'{key}_low'], 3)}, {format_number(row[f'{key}_high'], 3)}]"
+    return Table((title,), ["policy", "kind", "seeds", *table.header], lines)

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from baselines.errors import ResultsError
+from baselines.evaluation.columns import Record
 from baselines.evaluation.evaluate import Evaluation
-from baselines.evaluation.record import Record
 from baselines.evaluation.team_metrics import by_flight
 from baselines.files import FAILURES, RESULTS_FORMAT, plain_json, read_json
 from baselines.sweeps.comparison import Results

@@ -17,6 +17,7 @@ import numpy as np
 from quad_envs.names import unknown_name
 from quad_envs.registration import ENTRY, TEAMS, TRACKING, VECTOR_ENTRY
 
+from ..evaluation.columns import renamed
 from ..evaluation.evaluate import fly_and_measure
 from ..policies.network import Network, NetworkPolicy
 from ..policies.outside import import_named
@@ -41,7 +42,7 @@ class Point(NamedTuple):
     steps: int
     updates: int
     score: float  # mean over the held-out flights
-    cost: float  # mean summed quadratic cost; nan if a flight crashed
+    quadratic_cost: float  # mean over the flights; nan if one crashed
     violation_share: float  # of the steps
     crashes: int  # flights (of a team: vehicles) that crashed
     flights: int
@@ -54,7 +55,8 @@ def read_point(stored: Mapping[str, Any]) -> Point:
     Raises:
         KeyError, TypeError, ValueError: If a field is missing or is no number.
     """
-    values = {name: math.nan if stored[name] in (None, "") else float(stored[name]) for name in Point._fields}
+    known = renamed(stored)
+    values = {name: math.nan if known[name] in (None, "") else float(known[name]) for name in Point._fields}
     whole: dict[str, Any] = {name: int(values[name]) for name in _WHOLE}
     return Point(**{**values, **whole})
 
@@ -130,7 +132,7 @@ class HeldOutFlights:
             steps=progress.steps,
             updates=progress.update,
             score=summary["score"].mean,
-            cost=summary["cost"].mean,
+            quadratic_cost=summary["quadratic_cost"].mean,
             violation_share=summary["violation_share"].mean,
             crashes=int(np.sum([record.crashed for record in found.records])),
             flights=len(found.records),

@@ -32,8 +32,8 @@ def describe(point: Point) -> str:
     """A point of the curve in words."""
     return (
         f"{point.cpu_seconds:.1f} CPU-s, {point.steps} steps: score {point.score:.3f}, "
-        f"cost {format_number(point.cost)}, violations {100.0 * point.violation_share:.1f} %, "
-        f"crashes {point.crashes}/{point.flights}"
+        f"quadratic cost {format_number(point.quadratic_cost)}, "
+        f"violations {100.0 * point.violation_share:.1f} %, crashes {point.crashes}/{point.flights}"
     )
 
 
