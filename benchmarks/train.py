@@ -43,7 +43,7 @@ def _learner(env: VecEnv, options: PpoOptions, optimise: bool) -> Callable[[], o
     if not optimise:
         model.train = lambda: None  # type: ignore[method-assign]
     return lambda: model.learn(
-        env.num_envs * options.horizon, reset_num_timesteps=False, log_interval=1_000_000
+        env.num_envs * options.n_steps, reset_num_timesteps=False, log_interval=1_000_000
     )
 
 
@@ -64,7 +64,7 @@ def best_rates(
 
 def measure(rows: int, repetitions: int) -> dict[str, float]:
     """Steps per CPU-second, and the ratio of the rollouts."""
-    options = PpoOptions(rows=rows)
+    options = PpoOptions(n_envs=rows)
     single = DummyVecEnv([lambda: gymnasium.make(ENV_ID) for _ in range(rows)])
     found = best_rates(
         {
@@ -72,7 +72,7 @@ def measure(rows: int, repetitions: int) -> dict[str, float]:
             "rollouts": _learner(_flights(options), options, False),
             "rollouts, DummyVecEnv": _learner(single, options, False),
         },
-        rows * options.horizon,
+        rows * options.n_steps,
         repetitions,
     )
     return {**found, "ratio of rollouts": found["rollouts"] / found["rollouts, DummyVecEnv"]}

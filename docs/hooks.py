@@ -1,8 +1,8 @@
 """What MkDocs does to each page beyond its plugins, so that the site loads nothing from elsewhere.
 
 Equations become MathML when the site is built: `pymdownx.arithmatex` has marked them, their TeX escaped as
-HTML. The one script that the theme would take from the network is the copy in docs/vendor. And the table of
-the columns that evaluations have is written from `baselines.evaluation.columns`.
+HTML. The one script that the theme would take from the network is the copy in docs/vendor. And tables of what
+the code knows are written from it: the columns that evaluations have, the hyperparameters of the learners.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import re
 from typing import Any
 
 COLUMNS_HERE = "<!-- table: columns -->"
+HYPERPARAMETERS_HERE = "<!-- table: hyperparameters -->"
 _INLINE = re.compile(r'<span class="arithmatex">\\\((.*?)\\\)</span>', re.DOTALL)
 _DISPLAY = re.compile(r'<div class="arithmatex">\\\[(.*?)\\\]</div>', re.DOTALL)
 _SHIM, _OWN_SHIM = "https://unpkg.com/iframe-worker/shim", "vendor/iframe-worker.js"
@@ -36,9 +37,28 @@ def columns_table() -> str:
     return "\n".join(lines)
 
 
+def hyperparameter_tables() -> str:
+    """What each learner lets choose, in Markdown, from the comments in its options."""
+    from baselines.training.algorithms import ALGORITHMS
+    from baselines.training.hyperparameters import hyperparameters, plain_options
+    from quad_envs.field_comments import field_comments
+
+    lines = []
+    for name, entry in ALGORITHMS.items():
+        comments = field_comments(entry.options)
+        lines += [f"### {name}", "", "| hyperparameter | default | |", "|---|---|---|"]
+        values = plain_options(hyperparameters(name, ""))
+        lines += [f"| `{key}` | `{value!r}` | {comments[key]} |" for key, value in values.items()]
+        lines.append("")
+    return "\n".join(lines)
+
+
 def on_page_markdown(markdown: str, **kwargs: Any) -> str:
-    """The page with its table of columns, where it has one."""
-    return markdown.replace(COLUMNS_HERE, columns_table()) if COLUMNS_HERE in markdown else markdown
+    """The page with its tables of what the code knows, where it has one."""
+    for mark, table in ((COLUMNS_HERE, columns_table), (HYPERPARAMETERS_HERE, hyperparameter_tables)):
+        if mark in markdown:
+            markdown = markdown.replace(mark, table())
+    return markdown
 
 
 def to_mathml(tex: str, display: str) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from reprlib import Repr
 
 _MOST_DIGITS = 40
+_LIKE = 0.5  # likeness, 0 to 1, from which a name is suggested
 _WORD, _LINE = 240, 2000  # characters
 
 
@@ -43,20 +44,20 @@ def shortened(text: str) -> str:
     return line if len(line) <= _LINE else f"{line[: _LINE - 3]}..."
 
 
-def nearest_name(name: object, known: Iterable[str]) -> str | None:
-    """The known name that this one is a slip of, if there is one."""
-    near = difflib.get_close_matches(str(name)[:100], list(known), n=1, cutoff=0.5)
+def nearest_name(name: object, known: Iterable[str], like: float = _LIKE) -> str | None:
+    """The known name that this one is a slip of, if there is one; at least `like` it, 0 to 1."""
+    near = difflib.get_close_matches(str(name)[:100], list(known), n=1, cutoff=like)
     return near[0] if near else None
 
 
-def unknown_name(kind: str, name: object, known: Iterable[str]) -> str:
+def unknown_name(kind: str, name: object, known: Iterable[str], like: float = _LIKE) -> str:
     """An error message with the nearest known name, if there is one, and all of them."""
-    return f"unknown {kind} {shown(name)}; {suggestion(name, known)}"
+    return f"unknown {kind} {shown(name)}; {suggestion(name, known, like)}"
 
 
-def suggestion(name: object, known: Iterable[str]) -> str:
+def suggestion(name: object, known: Iterable[str], like: float = _LIKE) -> str:
     """The nearest known name, if there is one, and all of them."""
     names = list(known)
-    near = nearest_name(name, names)
+    near = nearest_name(name, names, like)
     hint = "" if near is None else f"did you mean {near!r}? "
     return f"{hint}known: {', '.join(names) if names else 'none'}"

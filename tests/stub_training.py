@@ -17,8 +17,8 @@ class StubOptions:
     """Of the stub."""
 
     gain: float = 1.0
-    hidden: tuple[int, ...] = (4,)
-    rows: int = 100
+    net_arch: tuple[int, ...] = (4,)
+    n_envs: int = 100
     fails_at: int = 0
     how: str = ""
     follows: bool = False  # hands out the network that it begins with
@@ -46,7 +46,7 @@ def stub(task_options, options, seed, spent, start=None):
         weights = np.zeros((len(features.names), 4), np.float32)
         reward = np.inf if options.how == "infinite" and update == options.fails_at else 0.5
         drawn = Network(features, (weights,), (bias.astype(np.float32),))
-        yield Progress(update, options.rows * update, reward), start if options.follows else drawn
+        yield Progress(update, options.n_envs * update, reward), start if options.follows else drawn
         if start is not None:
             assert len(start.weights) == 1
 

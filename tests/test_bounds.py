@@ -441,18 +441,18 @@ def test_processes_that_the_memory_does_not_hold_are_refused(monkeypatch):
 @pytest.mark.parametrize(
     ("algorithm", "hyper"),
     [
-        ("ppo", {"rows": 10**9}),
-        ("ppo", {"horizon": 10**60}),
-        ("ppo", {"batch": 10**60}),
-        ("ppo", {"hidden": [10**9]}),
-        ("ppo", {"hidden": [64] * 1000}),
+        ("ppo", {"n_envs": 10**9}),
+        ("ppo", {"n_steps": 10**60}),
+        ("ppo", {"batch_size": 10**60}),
+        ("ppo", {"net_arch": [10**9]}),
+        ("ppo", {"net_arch": [64] * 1000}),
         ("ppo-lagrangian", {"probes": 10**9}),
-        ("sac", {"memory": 10**12}),
-        ("apg", {"flights": 10**9}),
+        ("sac", {"buffer_size": 10**12}),
+        ("apg", {"n_envs": 10**9}),
         ("apg", {"substeps": 10**9}),
-        ("dagger", {"window": 10**9}),
-        ("dagger", {"fits": 10**60}),
-        ("ppo", {"rows": 100_000, "horizon": 10_000}),
+        ("dagger", {"n_steps": 10**9}),
+        ("dagger", {"gradient_steps": 10**60}),
+        ("ppo", {"n_envs": 100_000, "n_steps": 10_000}),
     ],
 )
 def test_hyperparameters_that_no_machine_holds_are_refused(algorithm, hyper):

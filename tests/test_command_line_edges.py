@@ -47,7 +47,7 @@ def fails(capsys, *arguments):
         ["benchmark", f"{LONG}.toml"],
         ["benchmark", "quick", "--engine", LONG],
         ["train", HELIX, LONG],
-        ["train", HELIX, "ppo", "--hyper", f"rows={LONG}"],
+        ["train", HELIX, "ppo", "--hyper", f"n_envs={LONG}"],
         ["train", HELIX, "ppo", "--from", LONG],
         ["reproduce", LONG],
         ["report", LONG],

@@ -119,9 +119,19 @@ def test_ppo_goes_on_from_what_imitated():
     from baselines.training.sb3 import PpoOptions, train_ppo
 
     options, steps = training_options(FORMATION, {"vehicles": 3, "formation": "triangle"}), iter([0.0, 1.0])
-    small = DaggerOptions(rows=6, window=3, fits=1, final_fits=1, hidden=(8,), squash="clip", stages=(0, 2))
+    small = DaggerOptions(
+        n_envs=6,
+        n_steps=3,
+        gradient_steps=1,
+        final_gradient_steps=1,
+        net_arch=(8,),
+        squash="clip",
+        stages=(0, 2),
+    )
     ((_, start),) = dagger(options, small, 0, lambda: next(steps))
-    given = PpoOptions(rows=6, horizon=8, batch=64, epochs=1, hidden=(8,), stages=(0, 2), critic_updates=1)
+    given = PpoOptions(
+        n_envs=6, n_steps=8, batch_size=64, n_epochs=1, net_arch=(8,), stages=(0, 2), critic_updates=1
+    )
     _, network = next(train_ppo(options, given, 0, lambda: 0.0, start))
     np.testing.assert_array_equal(network.weights[0], start.weights[0])
     assert network.features == start.features and network.squash == "clip"
@@ -130,8 +140,8 @@ def test_ppo_goes_on_from_what_imitated():
 @pytest.mark.parametrize(
     ("algorithm", "options"),
     [
-        (dagger, DaggerOptions(expert="lqr", rows=8, window=5, fits=2, final_fits=4)),
-        (policy_gradient, PolicyGradientOptions(flights=8, horizon=5)),
+        (dagger, DaggerOptions(expert="lqr", n_envs=8, n_steps=5, gradient_steps=2, final_gradient_steps=4)),
+        (policy_gradient, PolicyGradientOptions(n_envs=8, n_steps=5)),
     ],
 )
 def test_equal_seeds_give_equal_networks(algorithm, options):
@@ -156,7 +166,10 @@ def test_a_network_with_other_layers_is_no_start():
 
 
 def test_a_network_that_sees_something_else_is_no_start():
-    options, steps = DaggerOptions(expert="lqr", hidden=(8,), rows=4, window=1, fits=1), iter([0.0, 1.0])
+    options, steps = (
+        DaggerOptions(expert="lqr", net_arch=(8,), n_envs=4, n_steps=1, gradient_steps=1),
+        iter([0.0, 1.0]),
+    )
     _, own = next(dagger(training_options(HELIX, {}), options, 0, lambda: next(steps)))
     scaled = replace(own, features=replace(own.features, scale=tuple(2.0 * s for s in own.features.scale)))
     with pytest.raises(ValueError, match="sees other features"):

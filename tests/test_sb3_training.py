@@ -46,7 +46,7 @@ from quad_envs.envs.tracking.vector import TrackingVectorEnv
 from quad_envs.registration import TRACKING
 
 SHORT = {"reference": "random", "time_limit": 1.0, "preview": 3}
-SMALL = PpoOptions(rows=8, horizon=16, batch=64, epochs=2, hidden=(16, 16))
+SMALL = PpoOptions(n_envs=8, n_steps=16, batch_size=64, n_epochs=2, net_arch=(16, 16))
 
 
 @pytest.fixture(autouse=True)
@@ -267,7 +267,7 @@ def test_the_policy_follows_rewards_less_what_violations_cost(m):
     box = spaces.Box(-1, 1, (env.observation_space.shape[0],)), spaces.Box(-1, 1, (4,))
     plain = RowBuffer(3, *box, gae_lambda=0.9, gamma=0.95, n_envs=4)
     paying = LagrangianBuffer(
-        3, *box, gae_lambda=0.9, gamma=0.95, n_envs=4, env=env, multiplier=multiplier, epochs=0
+        3, *box, gae_lambda=0.9, gamma=0.95, n_envs=4, env=env, multiplier=multiplier, n_epochs=0
     )
     features, zeros = env.reset(), torch.zeros(4)
     for buffer in (plain, paying):
@@ -299,7 +299,7 @@ def test_a_critic_of_costs_learns_what_follows():
 
 def test_violations_are_measured_without_the_noise_of_training():
     task = TrackingOptions.from_kwargs(TRACKING["quad/CorridorTracking-v0"])
-    options = replace(SMALL, log_std=0.0)
+    options = replace(SMALL, log_std_init=0.0)
     model = make_ppo(make_flights(task, options, 0), options, 0, lambda: 0.0)
     # A new network hovers without noise, which keeps the rate limit; with noise nothing does.
     assert Probe(corridor(16, 1)).share(model, 10) < 0.5
@@ -314,7 +314,7 @@ def test_the_multiplier_rests_while_training_is_free(monkeypatch):
     seen = []
     monkeypatch.setattr(Multiplier, "update", lambda self, share: seen.append(share))
     task = TrackingOptions.from_kwargs(TRACKING["quad/CorridorTracking-v0"])
-    options = PpoLagrangianOptions(rows=4, horizon=8, batch=32, epochs=1, hidden=(8,), free=0.5)
+    options = PpoLagrangianOptions(n_envs=4, n_steps=8, batch_size=32, n_epochs=1, net_arch=(8,), free=0.5)
     share = [0.0]
     generator = train_ppo_lagrangian(task, options, 0, lambda: share[0])
     next(generator)
@@ -342,7 +342,7 @@ def test_an_exported_network_decides_as_the_learner_without_noise(algorithm):
         env = make_flights(options, SMALL, 0)
         model = make_ppo(env, replace(SMALL, learning_rate=0.05), 0, lambda: 0.0)
     else:
-        small = SacOptions(rows=8, batch=32, warm_up=16, hidden=(16, 16), learning_rate=0.05)
+        small = SacOptions(n_envs=8, batch_size=32, learning_starts=16, net_arch=(16, 16), learning_rate=0.05)
         env = make_flights(options, small, 0)
         model = make_sac(env, small, 0, lambda: 0.0)
     model.learn(8 * 32)
@@ -364,9 +364,19 @@ def test_an_exported_network_decides_as_the_learner_without_noise(algorithm):
         (train_ppo, SMALL),
         (
             train_ppo_lagrangian,
-            PpoLagrangianOptions(rows=8, horizon=16, batch=64, epochs=2, hidden=(16, 16)),
+            PpoLagrangianOptions(n_envs=8, n_steps=16, batch_size=64, n_epochs=2, net_arch=(16, 16)),
         ),
-        (train_sac, SacOptions(rows=8, horizon=8, warm_up=32, batch=32, hidden=(16, 16), memory=1000)),
+        (
+            train_sac,
+            SacOptions(
+                n_envs=8,
+                progress_steps=8,
+                learning_starts=32,
+                batch_size=32,
+                net_arch=(16, 16),
+                buffer_size=1000,
+            ),
+        ),
     ],
     ids=["ppo", "ppo-lagrangian", "sac"],
 )
@@ -421,16 +431,16 @@ def test_a_policy_with_other_layers_is_refused_as_a_start():
     task = TrackingOptions.from_kwargs({})
     _, start = first_updates(train_ppo(task, SMALL, 0, lambda: 0.0), 1)[-1]
     with pytest.raises(ValueError, match=r"layers \[.*16.*\].*go on with the algorithm"):
-        next(train_ppo(task, replace(SMALL, hidden=(8, 8)), 0, lambda: 0.0, start))
+        next(train_ppo(task, replace(SMALL, net_arch=(8, 8)), 0, lambda: 0.0, start))
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rows": 0}, r"rows must be finite and positive, got 0"),
+        ({"n_envs": 0}, r"n_envs must be finite and positive, got 0"),
         ({"learning_rate": float("nan")}, r"learning_rate must be finite and positive, got nan"),
-        ({"discount": 1.5}, r"discount must be at most 1, got 1.5"),
-        ({"hidden": ()}, r"hidden needs at least one layer"),
+        ({"gamma": 1.5}, r"gamma must be at most 1, got 1.5"),
+        ({"net_arch": ()}, r"net_arch needs at least one layer"),
     ],
 )
 def test_senseless_hyperparameters_are_refused(changes, message):
@@ -456,7 +466,9 @@ def test_ppo_is_refused_where_actions_are_estimates():
 def test_ppo_lagrangian_is_refused_where_there_are_no_limits():
     with pytest.raises(ValueError, match=r"has no limits that ppo-lagrangian could keep"):
         next(
-            train_ppo_lagrangian(TrackingOptions.from_kwargs({}), PpoLagrangianOptions(rows=8), 0, lambda: 0)
+            train_ppo_lagrangian(
+                TrackingOptions.from_kwargs({}), PpoLagrangianOptions(n_envs=8), 0, lambda: 0
+            )
         )
 
 

@@ -61,7 +61,7 @@ def plain_warnings() -> Iterator[None]:
 
 
 def list_names(options: ListOptions) -> int:
-    """Print what there is, or the options of one environment or policy."""
+    """Print what there is, or the options of one environment, policy or training algorithm."""
     from quad_envs.registration import TRACKING
     from quad_envs.vehicles import VEHICLES
 
@@ -69,6 +69,7 @@ def list_names(options: ListOptions) -> int:
     from ..policies.registry import TEAM_POLICIES, TRACKING_POLICIES
     from ..policies.trained import shipped_policies
     from ..sweeps.suite_files import suite_names
+    from ..training.algorithms import ALGORITHMS
 
     if options.name:
         return _list_options(options)
@@ -81,6 +82,9 @@ def list_names(options: ListOptions) -> int:
         name: f"{vehicle.about}, thrust-to-weight {vehicle.thrust_to_weight:.2g} ({vehicle.source})"
         for name, vehicle in VEHICLES.items()
     }
+    algorithms = {
+        name: f"{entry.description}; for {', '.join(entry.missions)}" for name, entry in ALGORITHMS.items()
+    }
     if options.json:
         found = {"environments": TRACKING, "team_environments": TEAM_KINDS, "vehicles": vehicles}
         print(
@@ -91,6 +95,7 @@ def list_names(options: ListOptions) -> int:
                     "team_policies": team,
                     "trained_policies": shipped_policies(),
                     "installed_policies": installed_policies(),
+                    "algorithms": algorithms,
                     "suites": suite_names(),
                 },
                 indent=1,
@@ -109,6 +114,7 @@ def list_names(options: ListOptions) -> int:
         ("policies for several vehicles", team),
         ("trained policies", shipped_policies() or {"-": "none; quad-envs train ENV ALGORITHM makes one"}),
         ("policies of other packages", installed_policies()),
+        ("training algorithms", algorithms),
         ("suites", suite_names()),
     ):
         if not entries:
@@ -116,19 +122,23 @@ def list_names(options: ListOptions) -> int:
         print(title)
         for name, text in entries.items():
             print(f"  {name:28} {text}")
-    print("\nquad-envs list NAME shows the options of an environment or a policy")
+    print("\nquad-envs list NAME shows the options of an environment, a policy or a training algorithm")
     return 0
 
 
 def _list_options(options: ListOptions) -> int:
     from dataclasses import fields
 
+    from quad_envs.field_comments import field_comments
     from quad_envs.registration import TEAMS, TRACKING
 
     from ..policies.outside import installed_policies
     from ..policies.registry import TEAM_POLICIES, TRACKING_POLICIES, from_outside, policy_options
+    from ..training.algorithms import ALGORITHMS, options_of
+    from ..training.hyperparameters import hyperparameters, plain_options
 
-    names = [*TRACKING, *TEAMS, *TRACKING_POLICIES, *TEAM_POLICIES, *installed_policies()]
+    names = [*TRACKING, *TEAMS, *TRACKING_POLICIES, *TEAM_POLICIES, *installed_policies(), *ALGORITHMS]
+    comments: dict[str, str] = {}
     if options.name in (*TRACKING, *TEAMS):
         if options.name in TEAMS:
             kind = import_module(TEAMS[options.name]).raw_env.options_type
@@ -137,7 +147,10 @@ def _list_options(options: ListOptions) -> int:
         values = {entry.name: entry.default for entry in fields(kind) if entry.init}
         values |= TRACKING.get(options.name, {})
         del values["env_id"]
-        flag = "--set"
+        flag, comments = "--set", field_comments(kind)
+    elif options.name in ALGORITHMS:
+        values, flag = plain_options(hyperparameters(options.name, "")), "train --hyper"
+        comments = field_comments(options_of(options.name))
     elif options.name in names or from_outside(options.name):
         values, flag = policy_options(options.name), "--policy-set"
     else:
@@ -147,7 +160,8 @@ def _list_options(options: ListOptions) -> int:
         return 0
     print(f"options of {options.name} and their defaults; on the command line {flag} KEY=VALUE")
     for name, value in values.items():
-        print(f"  {name:20} {value!r}")
+        text = comments.get(name, "")
+        print(f"  {name:20} {f'{value!r:16} # {text}' if text else repr(value)}")
     return 0
 
 

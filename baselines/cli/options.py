@@ -31,7 +31,7 @@ class Positional(str):
 class ListOptions:
     """What there is: environments, policies, suites."""
 
-    name: Annotated[str, Positional("an environment id or a policy, to see its options")] = ""
+    name: Annotated[str, Positional("environment, policy or training algorithm, to see its options")] = ""
     json: Annotated[bool, "print JSON"] = False
 
 
@@ -90,7 +90,7 @@ class TrainOptions:
     set: Annotated[list[str], "keyword argument of the environment; JSON, {key: value}, or text"] = field(
         default_factory=list
     )
-    hyper: Annotated[list[str], "hyperparameter of the algorithm; JSON, {key: value}, or text"] = field(
+    hyper: Annotated[list[str], "hyperparameter, as in quad-envs list ALGORITHM; JSON, or text"] = field(
         default_factory=list
     )
     from_: Annotated[str, "begin with the network of a checkpoint: its folder, or a shipped policy"] = ""

@@ -157,7 +157,7 @@ def _trainings(table: Any, suite: str) -> list[Training]:
     given = {name: value for name, value in table.items() if name != "seeds"}
     if not isinstance(given.get("hyper", {}), Mapping):
         raise ValueError(
-            f"suite {suite!r}: hyper of a training must be a table, as {{rows = 64}}, "
+            f"suite {suite!r}: hyper of a training must be a table, as {{n_envs = 64}}, "
             f"got {shown(given['hyper'])}"
         )
     seeds = table.get("seeds", [given.pop("seed", 0)])

@@ -1,8 +1,13 @@
-"""Hyperparameters of each algorithm, as values: reading them loads no torch."""
+"""Hyperparameters of each algorithm, as values: reading them loads no torch.
+
+A name of Stable-Baselines3 means what it means there; what it has no name for has one of ours. The comment of
+a field is its documentation everywhere.
+"""
 
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
@@ -13,40 +18,42 @@ if TYPE_CHECKING:
     from ..policies.network import Squash
 
 _POSITIVE = (
-    *("rows", "horizon", "batch", "epochs", "learning_rate", "final_rate", "discount", "clip"),
-    *("gradient_norm", "gradient_steps", "memory", "smoothing", "probes"),
+    *("n_envs", "n_steps", "progress_steps", "batch_size", "n_epochs", "learning_rate", "final_rate"),
+    *("gamma", "clip_range", "max_grad_norm", "train_freq", "gradient_steps", "buffer_size", "tau", "probes"),
 )
 # Hyperparameters that take memory or time, and the largest that make sense.
 _MOST = {
-    **dict.fromkeys(("rows", "flights", "probes"), 100_000),
-    **dict.fromkeys(("horizon", "final_horizon", "window"), 10_000),
-    **dict.fromkeys(("epochs", "gradient_steps", "substeps"), 1_000),
-    **dict.fromkeys(("fits", "final_fits", "critic_updates", "episode_steps"), 1_000_000),
-    "batch": 10_000_000,
-    "memory": 100_000_000,
-    "warm_up": 1_000_000_000,
+    **dict.fromkeys(("n_envs", "probes"), 100_000),
+    **dict.fromkeys(("n_steps", "final_n_steps", "progress_steps", "train_freq"), 10_000),
+    **dict.fromkeys(("n_epochs", "substeps"), 1_000),
+    **dict.fromkeys(("gradient_steps", "final_gradient_steps", "critic_updates", "episode_steps"), 1_000_000),
+    "batch_size": 10_000_000,
+    "buffer_size": 100_000_000,
+    "learning_starts": 1_000_000_000,
 }
-_MAY_BE_NONE = ("fits", "final_fits", "critic_updates", "warm_up")
+_MAY_BE_NONE = ("gradient_steps", "final_gradient_steps", "critic_updates", "learning_starts")
 _WIDEST, _MOST_LAYERS = 10_000, 20
-_SHARES = ("free", "final_rate", "discount", "trace", "smoothing")
+_SHARES = ("free", "final_rate", "gamma", "gae_lambda", "tau")
+_WEIGHTS = ("vf_coef",)  # that may be zero
+_AUTO = re.compile(r"auto(_(?=[0-9.]*[1-9])[0-9]*\.?[0-9]+(e-?[0-9]+)?)?")
 
 
 @dataclass(frozen=True, slots=True)
 class PolicyGradientOptions:
     """Hyperparameters of the analytic policy gradient."""
 
-    flights: int = 64
-    horizon: int = 25  # steps of a window at the beginning
-    final_horizon: int = 25  # and at the end; long windows see more of what follows, but learn late
+    n_envs: int = 64  # flights at once
+    n_steps: int = 25  # of each flight in an update, a window, at the beginning
+    final_n_steps: int = 25  # and at the end; long windows see more of what follows, but learn late
     substeps: int = 2  # of the integrator while training; 5 in evaluation
-    learning_rate: float = 1e-2
+    learning_rate: float = 1e-2  # of Adam, at the beginning
     final_rate: float = 0.03  # share of the learning rate at the end of the budget
-    discount: float = 0.99
+    gamma: float = 0.99  # discount per step of a window
     epsilon: float = 1e-3  # of log(r + epsilon), at the beginning
     final_epsilon: float = 1e-3  # and at the end; the larger, the more it is the sum of rewards itself
     penalty: float = 0.0  # weight of the violation cost in the objective
-    hidden: tuple[int, ...] = (64, 64)
-    gradient_norm: float = 1.0  # to which gradients are clipped
+    net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers
+    max_grad_norm: float = 1.0  # to which gradients are clipped
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,16 +61,16 @@ class DaggerOptions:
     """Hyperparameters of DAgger."""
 
     expert: str = ""  # a policy, or a trained one; sdc-nmpc for one vehicle, consensus-mpc for formations
-    rows: int = 64  # flights, or vehicles of all teams
-    window: int = 20  # steps of each row between fits
-    expert_flies: float = 0.2  # share of the budget in which the rows that the expert flies fall to none
-    fits: int = 40  # minibatches after each window at the beginning
-    final_fits: int = 200  # and at the end of the budget, when there are many labels
-    batch: int = 512
-    learning_rate: float = 3e-3
+    n_envs: int = 64  # flights at once, or vehicles of all teams
+    n_steps: int = 20  # of each of them between fits
+    expert_flies: float = 0.2  # share of the budget in which those that the expert flies fall to none
+    gradient_steps: int = 40  # after each n_steps, at the beginning
+    final_gradient_steps: int = 200  # and at the end of the budget, when there are many labels
+    batch_size: int = 512  # labels of a gradient step
+    learning_rate: float = 3e-3  # of Adam, at the beginning
     final_rate: float = 0.02  # share of the learning rate at the end of the budget
     threshold: float = 0.05  # of an output's error, up to which the loss is quadratic
-    hidden: tuple[int, ...] = (64, 64)
+    net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers
     squash: Squash = "tanh"  # how outputs come into [-1, 1]; "clip" as PPO, which can then go on from here
     stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for the usual ones
     separation: float | None = None  # m, that the expert of a team keeps; None for the task's own
@@ -74,19 +81,20 @@ class DaggerOptions:
 class PpoOptions:
     """Hyperparameters of PPO."""
 
-    rows: int = 512  # flights, or vehicles of all teams
-    horizon: int = 32  # steps of each row in an update
-    batch: int = 4096
-    epochs: int = 5
-    learning_rate: float = 1e-3
+    n_envs: int = 512  # flights at once, or vehicles of all teams
+    n_steps: int = 32  # of each of them in an update
+    batch_size: int = 4096  # samples of a minibatch; made smaller or larger until all of an update are equal
+    n_epochs: int = 5  # passes over the samples of an update
+    learning_rate: float = 1e-3  # of Adam, at the beginning
     final_rate: float = 0.05  # share of the learning rate at the end of the budget
-    discount: float = 0.99
-    trace: float = 0.98  # lambda of the advantage estimate
-    clip: float = 0.2  # of the ratio of probabilities
-    log_std: float = -2.0  # at the start
-    entropy: float = 0.0  # weight of the entropy bonus
-    gradient_norm: float = 0.5  # to which gradients are clipped
-    hidden: tuple[int, ...] = (64, 64)
+    gamma: float = 0.99  # discount per step
+    gae_lambda: float = 0.98  # of the advantage estimate
+    clip_range: float = 0.2  # of the ratio of probabilities
+    log_std_init: float = -2.0  # log of an action's standard deviation at the start
+    ent_coef: float = 0.0  # weight of the entropy bonus
+    vf_coef: float = 0.5  # weight of the value function's loss
+    max_grad_norm: float = 0.5  # to which gradients are clipped
+    net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers, of policy and critic alike
     stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for the usual ones
     episode_steps: int | None = None  # of a flight in training; None for the task's own
     critic_updates: int = 5  # of the critic alone, where training goes on from a policy
@@ -110,22 +118,30 @@ class PpoLagrangianOptions(PpoOptions):
 class SacOptions:
     """Hyperparameters of SAC."""
 
-    rows: int = 64
-    gradient_steps: int = 4  # for each step of all rows
-    batch: int = 256
-    memory: int = 500_000  # steps in the replay buffer
-    warm_up: int = 5_000  # steps of random actions
-    learning_rate: float = 1e-3
+    n_envs: int = 64  # flights at once
+    train_freq: int = 1  # steps of each flight between updates
+    gradient_steps: int = 4  # of an update
+    batch_size: int = 256  # samples of a gradient step
+    buffer_size: int = 500_000  # steps in the replay buffer, of all flights
+    learning_starts: int = 5_000  # steps of random actions before, of all flights
+    learning_rate: float = 1e-3  # of Adam, at the beginning
     final_rate: float = 0.1  # share of the learning rate at the end of the budget
-    discount: float = 0.98
-    smoothing: float = 0.01  # of the target critics
-    hidden: tuple[int, ...] = (64, 64)
+    gamma: float = 0.98  # discount per step
+    tau: float = 0.01  # by which the target critics follow in a gradient step
+    ent_coef: float | str = "auto_0.01"  # weight of the entropy; "auto_0.01" learns it, from 0.01
+    net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers, of policy and critics alike
     stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for the usual ones
     episode_steps: int | None = None  # of a flight in training; None for the task's own
-    horizon: int = 64  # steps of each row between two reports
+    progress_steps: int = 64  # of each flight between two looks at the policy
 
     def __post_init__(self) -> None:
         _check_numbers(self)
+        weight = self.ent_coef
+        if not (_AUTO.fullmatch(weight) if isinstance(weight, str) else 0.0 <= weight < math.inf):
+            raise ValueError(
+                "hyperparameter ent_coef must be finite and >= 0, or 'auto' or as 'auto_0.01', got "
+                f"{shown(weight)}"
+            )
 
 
 def check_sizes(options: Any, width: int) -> None:
@@ -143,18 +159,16 @@ def check_sizes(options: Any, width: int) -> None:
         if value is not None and one.name in _MOST:
             least, most = int(one.name not in _MAY_BE_NONE), _MOST[one.name]
             require_whole(f"hyperparameter {one.name}", value, least, most, lambda n: 4 * n * width)
-    hidden = options.hidden
-    if len(hidden) > _MOST_LAYERS:
-        raise ValueError(f"hyperparameter hidden has at most {_MOST_LAYERS} layers, got {shown(hidden)}")
-    for n in hidden:
-        require_whole("a layer of hyperparameter hidden", n, 1, _WIDEST, lambda n: 4 * n * (n + width))
-    rows = getattr(options, "rows", getattr(options, "flights", 1))
-    stages = getattr(options, "horizon", getattr(options, "window", 1))
-    kept = rows * stages + 2 * getattr(options, "memory", 0)
+    layers = options.net_arch
+    if len(layers) > _MOST_LAYERS:
+        raise ValueError(f"hyperparameter net_arch has at most {_MOST_LAYERS} layers, got {shown(layers)}")
+    for n in layers:
+        require_whole("a layer of hyperparameter net_arch", n, 1, _WIDEST, lambda n: 4 * n * (n + width))
+    kept = options.n_envs * getattr(options, "n_steps", 1) + 2 * getattr(options, "buffer_size", 0)
     require_memory(
         f"training with {kept} observations of {width} numbers at a time",
         4 * kept * width,
-        "lower the hyperparameters rows, horizon or memory",
+        "lower the hyperparameters n_envs, n_steps or buffer_size",
     )
 
 
@@ -164,7 +178,7 @@ def _check_numbers(options: PpoOptions | SacOptions) -> None:
     Raises:
         ValueError: If there is one; the message names it.
     """
-    for name in {field.name for field in fields(options)} & {*_POSITIVE, *_SHARES}:
+    for name in {field.name for field in fields(options)} & {*_POSITIVE, *_SHARES, *_WEIGHTS}:
         value = getattr(options, name)
         if not 0.0 <= value < math.inf or (name in _POSITIVE and value == 0.0):
             raise ValueError(f"hyperparameter {name} must be finite and positive, got {shown(value)}")
@@ -172,7 +186,7 @@ def _check_numbers(options: PpoOptions | SacOptions) -> None:
             raise ValueError(f"hyperparameter {name} must be at most 1, got {shown(value)}")
     if options.episode_steps is not None and options.episode_steps < 1:
         raise ValueError(f"hyperparameter episode_steps must be >= 1, got {shown(options.episode_steps)}")
-    if not options.hidden or min(options.hidden) < 1:
+    if not options.net_arch or min(options.net_arch) < 1:
         raise ValueError(
-            f"hyperparameter hidden needs at least one layer, of widths >= 1: {options.hidden!r}"
+            f"hyperparameter net_arch needs at least one layer, of widths >= 1: {options.net_arch!r}"
         )

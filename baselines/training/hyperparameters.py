@@ -7,7 +7,7 @@ table before it; the first of them are the defaults of the options dataclass.
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import MISSING, asdict, fields
 from importlib import resources
 from typing import Any
@@ -15,12 +15,15 @@ from typing import Any
 from quad_envs.kinds import is_number
 from quad_envs.names import shown, unknown_name
 
-from .algorithms import options_of
+from .algorithms import ALGORITHMS, options_of
+from .former_names import in_names_of_today, may_be_slip, name_of_today
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
+
+_SLIP = 0.75  # likeness from which a name is taken for a slip: many names of learners are alike
 
 
 def hyperparameter_file(algorithm: str) -> dict[str, dict[str, Any]]:
@@ -61,11 +64,38 @@ def plain_options(options: Any) -> dict[str, Any]:
     }
 
 
+def recorded_hyperparameters(algorithm: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """What a run or a checkpoint recorded, under the names of today.
+
+    Args:
+        algorithm: Its name; of one that is not there, the record stays as it is.
+        values: As they were recorded, maybe by an earlier version. What that did not say yet had its default.
+    """
+    if algorithm not in ALGORITHMS:
+        return dict(values)
+    defaults = plain_options(options_of(algorithm)())
+    return defaults | in_names_of_today(values, defaults)
+
+
+def _unknown(algorithm: str, name: str, known: Collection[str]) -> str:
+    """What to say of a hyperparameter that an algorithm has not."""
+    today = name_of_today(name, known)
+    if today is not None:
+        return f"hyperparameter {shown(name)} of {algorithm!r} is called {today!r}"
+    owners = [other for other in ALGORITHMS if name in {entry.name for entry in fields(options_of(other))}]
+    if owners:
+        have = f"{' and '.join(owners)} {'has' if len(owners) == 1 else 'have'} one"
+        return f"{algorithm!r} has no hyperparameter {shown(name)}, {have}; known: {', '.join(known)}"
+    near = _SLIP if may_be_slip(name) else 1.0
+    return unknown_name(f"hyperparameter of {algorithm!r}", name, known, near)
+
+
 def _checked(kind: type[Any], algorithm: str, name: str, value: Any, source: str) -> Any:
     """A value as its field wants it."""
     known = {entry.name: entry for entry in fields(kind)}
     if name not in known:
-        raise ValueError(f"{unknown_name(f'hyperparameter of {algorithm!r}', name, known)} ({source})")
+        shows = f"({source}; quad-envs list {algorithm} shows what each is)"
+        raise ValueError(f"{_unknown(algorithm, name, known)} {shows}")
     default = known[name].default
     if default is MISSING or default is None or value is None:
         if not (value is None or is_number(value) or isinstance(value, str | list | tuple)):
@@ -78,6 +108,11 @@ def _checked(kind: type[Any], algorithm: str, name: str, value: Any, source: str
         value = tuple(value) if fits else value
     elif isinstance(default, bool):
         fits, wanted = isinstance(value, bool), "true or false"
+    elif isinstance(default, str) and "float" in str(known[name].type):
+        fits, wanted = (
+            isinstance(value, int | float | str) and not isinstance(value, bool),
+            "a number or text",
+        )
     elif isinstance(default, int):
         fits, wanted = isinstance(value, int) and not isinstance(value, bool), "a whole number"
     elif isinstance(default, float):

@@ -192,9 +192,9 @@ def train(
                 f"hyperparameter episode_steps = {options.episode_steps!r} is for teams: leave it out"
             )
         task_options = replace(task_options, max_cycles=options.episode_steps)
-    flights = LabelledFlights(task_options, expert, options.rows, seed, options.stages)
+    flights = LabelledFlights(task_options, expert, options.n_envs, seed, options.stages)
     features, outputs = flights.features, flights.outputs
-    actor = Actor(len(features.names), options.hidden, outputs, options.squash)
+    actor = Actor(len(features.names), options.net_arch, outputs, options.squash)
     if start is not None:
         actor.load(start, features)
     labels, rng = Labels(len(features.names), outputs), np.random.default_rng([_STREAM, seed, 1])
@@ -202,13 +202,13 @@ def train(
     network, update = Network(features, *actor.arrays(), squash=options.squash), 0
     while (share := spent()) < 1.0:
         beta = 0.0 if options.expert_flies <= 0.0 else max(0.0, 1.0 - share / options.expert_flies)
-        x, y, reward = flights.collect(network, beta, options.window)
+        x, y, reward = flights.collect(network, beta, options.n_steps)
         labels.add(x, y)
         for group in optimizer.param_groups:
             group["lr"] = options.learning_rate * (1.0 - (1.0 - options.final_rate) * share)
         update += 1
-        fits = round(options.fits + share * (options.final_fits - options.fits))
-        loss = _fit(actor, optimizer, labels, options, fits, rng)
+        first, last = options.gradient_steps, options.final_gradient_steps
+        loss = _fit(actor, optimizer, labels, options, round(first + share * (last - first)), rng)
         if not np.isfinite(loss):
             raise TrainingError(f"the loss is {loss} at update {update}: the last good policy is kept")
         network = Network(features, *actor.arrays(), squash=options.squash)
@@ -220,15 +220,15 @@ def _fit(
     optimizer: torch.optim.Optimizer,
     labels: Labels,
     options: DaggerOptions,
-    fits: int,
+    gradient_steps: int,
     rng: np.random.Generator,
 ) -> float:
     """Some minibatches; the last loss."""
     import torch
 
     loss = torch.zeros(())
-    for _ in range(fits):
-        x, y = labels.draw(options.batch, rng)
+    for _ in range(gradient_steps):
+        x, y = labels.draw(options.batch_size, rng)
         optimizer.zero_grad()
         loss = torch.nn.functional.huber_loss(actor(x), y, delta=options.threshold)
         loss.backward()  # type: ignore[no-untyped-call]

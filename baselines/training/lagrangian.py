@@ -63,12 +63,12 @@ class LagrangianEnv(VecEnvWrapper):
 
     Args:
         venv: The flights.
-        discount: Of later costs.
+        gamma: Discount of later costs.
     """
 
-    def __init__(self, venv: TrainingVecEnv, discount: float) -> None:
+    def __init__(self, venv: TrainingVecEnv, gamma: float) -> None:
         super().__init__(venv)
-        self.flights, self.discount = venv, discount
+        self.flights, self.gamma = venv, gamma
         self.costs: list[Floats] = []  # of each step of the rollout, (rows,)
         self.truncations: list[tuple[int, int, Floats]] = []  # step, row and last features of what was cut
         self.last: Floats = np.zeros((0, 0), dtype=np.float32)  # features after the last step
@@ -89,7 +89,7 @@ class LagrangianEnv(VecEnvWrapper):
             for row in np.flatnonzero(dones).tolist()
             if infos[row]["TimeLimit.truncated"]
         ]
-        crash = 1.0 / (1.0 - self.discount) if self.discount < 1.0 else float(self.flights.task.episode_steps)
+        crash = 1.0 / (1.0 - self.gamma) if self.gamma < 1.0 else float(self.flights.task.episode_steps)
         self.costs.append(np.where(self.flights.crashed, crash, self.flights.violated).astype(np.float32))
         self.last = observations
         return observations, rewards, dones, infos
@@ -112,10 +112,10 @@ class CostCritic:
             out: Floats = self._network(torch.from_numpy(features)).numpy()[..., 0]
         return out
 
-    def fit(self, features: Floats, returns: Floats, epochs: int) -> None:
+    def fit(self, features: Floats, returns: Floats, n_epochs: int) -> None:
         """Learn returns (n,) of features (n, inputs)."""
         x, y = torch.from_numpy(features), torch.from_numpy(returns)
-        for _ in range(epochs):
+        for _ in range(n_epochs):
             order = torch.randperm(len(x))
             for first in range(0, len(x), _BATCH):
                 rows = order[first : first + _BATCH]
@@ -134,15 +134,15 @@ class LagrangianBuffer(RowBuffer):
         args: Of the rollout buffer.
         env: Has the costs of the rollout.
         multiplier: Read at the end of each rollout.
-        epochs: Of the critic after each rollout.
+        n_epochs: Of the critic after each rollout.
         kwargs: Of the rollout buffer.
     """
 
     def __init__(
-        self, *args: Any, env: LagrangianEnv, multiplier: Multiplier, epochs: int, **kwargs: Any
+        self, *args: Any, env: LagrangianEnv, multiplier: Multiplier, n_epochs: int, **kwargs: Any
     ) -> None:
         super().__init__(*args, **kwargs)
-        self._env, self._multiplier, self._epochs = env, multiplier, epochs
+        self._env, self._multiplier, self._n_epochs = env, multiplier, n_epochs
         self.critic = CostCritic(int(self.observations.shape[-1]))
 
     def reset(self) -> None:
@@ -154,7 +154,7 @@ class LagrangianBuffer(RowBuffer):
     def compute_returns_and_advantage(self, last_values: torch.Tensor, dones: Bools) -> None:
         """Advantages of the rewards and of the costs, and what the policy follows."""
         super().compute_returns_and_advantage(last_values, dones)
-        m, gamma = self._multiplier.value, self._env.discount
+        m, gamma = self._multiplier.value, self._env.gamma
         costs = np.stack(self._env.costs)
         if self._env.truncations:
             steps, rows, last = zip(*self._env.truncations, strict=True)
@@ -164,18 +164,18 @@ class LagrangianBuffer(RowBuffer):
             costs, values, self.critic(self._env.last), self.episode_starts, dones, gamma, self.gae_lambda
         )
         flat = self.observations.reshape(-1, self.observations.shape[-1])
-        self.critic.fit(flat, (advantages + values).reshape(-1), self._epochs)
+        self.critic.fit(flat, (advantages + values).reshape(-1), self._n_epochs)
         self.advantages = (self.advantages - np.float32(m) * advantages) / np.float32(1.0 + m)
 
 
 def cost_advantages(
-    costs: Floats, values: Floats, last: Floats, starts: Floats, dones: Bools, gamma: float, trace: float
+    costs: Floats, values: Floats, last: Floats, starts: Floats, dones: Bools, gamma: float, gae_lambda: float
 ) -> Floats:
     """Generalised advantages, (T, rows), of costs and values (T, rows), as those of the rewards."""
     out, running = np.empty_like(costs), np.zeros_like(last)
     goes_on, following = 1.0 - dones.astype(np.float32), last
     for t in range(len(costs) - 1, -1, -1):
-        running = costs[t] + gamma * goes_on * (following + trace * running) - values[t]
+        running = costs[t] + gamma * goes_on * (following + gae_lambda * running) - values[t]
         out[t] = running
         goes_on, following = 1.0 - starts[t], values[t]
     return out

@@ -66,7 +66,7 @@ class Actor:
         if [W.shape for W in network.weights] != shapes or kinds != own:
             raise ValueError(
                 f"cannot go on from layers {[W.shape for W in network.weights]} ({', '.join(kinds)}) with "
-                f"layers {shapes} ({', '.join(own)}): give the same hidden sizes and squash"
+                f"layers {shapes} ({', '.join(own)}): give the same net_arch and squash"
             )
         if network.features != features:
             raise ValueError(
@@ -87,13 +87,13 @@ class Actor:
 
 
 def _window_gradient(
-    actor: Actor, flights: DifferentiableFlights, options: PolicyGradientOptions, horizon: int, epsilon: float
+    actor: Actor, flights: DifferentiableFlights, options: PolicyGradientOptions, n_steps: int, epsilon: float
 ) -> float:
     """Roll a window out, take it back, leave the gradient in the actor's parameters; the mean reward."""
     import torch
 
     seen, outputs, records = [], [], []
-    for _ in range(horizon):
+    for _ in range(n_steps):
         x = torch.from_numpy(flights.observe()).requires_grad_()
         out = actor(x)
         seen.append(x)
@@ -101,9 +101,9 @@ def _window_gradient(
         records.append(flights.advance(hover_actions(out.detach().numpy(), flights.task)))
     n = flights.n
     plants, commands = np.zeros((n, 16)), np.zeros((n, 4))
-    for t in range(horizon - 1, -1, -1):
+    for t in range(n_steps - 1, -1, -1):
         record, x, out = records[t], seen[t], outputs[t]
-        weight = -(options.discount**t) / (n * horizon)
+        weight = -(options.gamma**t) / (n * n_steps)
         rewards = np.where(record.crashed, 0.0, weight / (record.rewards + epsilon))
         actions, plants, commands = flights.advance_vjp(
             record, plants, commands, rewards, -weight * options.penalty
@@ -139,8 +139,8 @@ def train(
     import torch
 
     torch.manual_seed(seed)
-    flights = DifferentiableFlights(task_options, options.flights, seed)
-    actor = Actor(len(flights.features.names), options.hidden, 4)
+    flights = DifferentiableFlights(task_options, options.n_envs, seed)
+    actor = Actor(len(flights.features.names), options.net_arch, 4)
     if start is not None:
         actor.load(start, flights.features)
     optimizer = torch.optim.Adam(actor.parameters, lr=options.learning_rate)
@@ -150,12 +150,12 @@ def train(
             group["lr"] = options.learning_rate * (1.0 - (1.0 - options.final_rate) * share)
         optimizer.zero_grad()
         epsilon = options.epsilon * (options.final_epsilon / options.epsilon) ** share
-        horizon = round(options.horizon + share * (options.final_horizon - options.horizon))
-        reward = _window_gradient(actor, flights, options, horizon, epsilon)
-        norm = float(torch.nn.utils.clip_grad_norm_(actor.parameters, options.gradient_norm))
+        n_steps = round(options.n_steps + share * (options.final_n_steps - options.n_steps))
+        reward = _window_gradient(actor, flights, options, n_steps, epsilon)
+        norm = float(torch.nn.utils.clip_grad_norm_(actor.parameters, options.max_grad_norm))
         if not np.isfinite(norm):
             raise TrainingError(f"the gradient is {norm} at update {update}: the last good policy is kept")
         optimizer.step()
         update += 1
-        steps += options.flights * horizon
+        steps += options.n_envs * n_steps
         yield Progress(update, steps, reward), Network(flights.features, *actor.arrays())

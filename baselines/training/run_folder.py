@@ -22,6 +22,7 @@ from ..files import plain_json, provenance, read_json, write_atomic, write_csv
 from ..policies.checkpoints import DESCRIPTION, WEIGHTS, load_checkpoint, save_checkpoint
 from ..policies.network import Network
 from .held_out import Point, read_point
+from .hyperparameters import recorded_hyperparameters
 
 _IDENTITY = ("env_id", "env_kwargs", "algorithm", "seed", "hyperparameters")  # a resumed run must agree
 _ORIGIN = "start_from"  # and this, which older runs do not say
@@ -82,7 +83,8 @@ class RunFolder:
             raise ResultsError(
                 f"{str(self.path)!r} holds no training that could be resumed; leave --resume out"
             )
-        asked = plain_json(self.about)
+        recorded = recorded_hyperparameters(found["algorithm"], found["hyperparameters"])
+        asked, found = plain_json(self.about), {**found, "hyperparameters": recorded}
         differing = [name for name in (*_IDENTITY, _ORIGIN) if found.get(name) != asked.get(name)]
         if differing:
             name = differing[0]
@@ -136,7 +138,8 @@ class RunFolder:
             return None
         found = read_json(path)
         if isinstance(found, dict) and found.get("training") and all(name in found for name in _IDENTITY):
-            return found
+            if isinstance(found["hyperparameters"], dict):
+                return found
         raise ResultsError(
             f"{str(self.path)!r} holds a config.json that no training has written; choose another folder"
         )

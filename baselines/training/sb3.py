@@ -6,9 +6,10 @@ what comes out is a `Network`.
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -81,12 +82,12 @@ def train_ppo_lagrangian(
             "tilt_limit, velocity_limit, position_limit or rate_limit"
         )
     multiplier = Multiplier(options.limit, options.proportional, options.integral)
-    env = LagrangianEnv(flights, options.discount)
-    buffer = {"env": env, "multiplier": multiplier, "epochs": options.epochs}
+    env = LagrangianEnv(flights, options.gamma)
+    buffer = {"env": env, "multiplier": multiplier, "n_epochs": options.n_epochs}
     torch.manual_seed(seed)
     model = make_ppo(env, options, seed, spent, (LagrangianBuffer, buffer))
     # Other starts than those of training, so that both see new ones.
-    probe = Probe(make_flights(task_options, replace(options, rows=options.probes), seed + _PROBES, start))
+    probe = Probe(make_flights(task_options, replace(options, n_envs=options.probes), seed + _PROBES, start))
     yield from _updates(model, flights, options, spent, start, (multiplier, probe))
 
 
@@ -116,7 +117,7 @@ def train_sac(
 def make_flights(
     task_options: TaskOptions, options: PpoOptions | SacOptions, seed: int, start: Network | None = None
 ) -> TrainingVecEnv:
-    """Flights to train on: as many teams as make about `rows` vehicles, or `rows` single ones.
+    """Flights to train on: as many teams as make about `n_envs` vehicles, or `n_envs` single ones.
 
     Raises:
         ValueError: If the preview has not the stages that the network shall see, or actions of the task are
@@ -126,7 +127,7 @@ def make_flights(
     features = training_features(task_options, options.stages)
     if start is not None:
         features = start.features
-    n = max(1, options.rows // size)
+    n = max(1, options.n_envs // size)
     return TrainingVecEnv(task_options, n, seed, features=features, episode_steps=options.episode_steps)
 
 
@@ -138,23 +139,17 @@ def make_ppo(
     buffer: tuple[type[RowBuffer], dict[str, Any]] = (RowBuffer, {}),
 ) -> PPO:
     """The learner, not yet trained; `buffer` is the class of its rollouts and what that needs."""
-    samples = env.num_envs * options.horizon
+    samples = env.num_envs * options.n_steps
+    arguments = _arguments(PPO, options, spent)
+    arguments["batch_size"] = math.ceil(samples / max(1, round(samples / options.batch_size)))
     model = PPO(
         "MlpPolicy",
         env,
-        learning_rate=_falling(options.learning_rate, options.final_rate, spent),
-        n_steps=options.horizon,
-        batch_size=math.ceil(samples / max(1, round(samples / options.batch))),
-        n_epochs=options.epochs,
-        gamma=options.discount,
-        gae_lambda=options.trace,
-        clip_range=options.clip,
-        ent_coef=options.entropy,
-        max_grad_norm=options.gradient_norm,
+        **arguments,
         policy_kwargs={
-            "net_arch": list(options.hidden),
+            "net_arch": list(options.net_arch),
             "activation_fn": Tanh,
-            "log_std_init": options.log_std,
+            "log_std_init": options.log_std_init,
             "optimizer_kwargs": {"eps": 1e-5, "fused": True},
         },
         rollout_buffer_class=buffer[0],
@@ -171,17 +166,9 @@ def make_sac(env: VecEnv, options: SacOptions, seed: int, spent: Callable[[], fl
     model = SAC(
         "MlpPolicy",
         env,
-        learning_rate=_falling(options.learning_rate, options.final_rate, spent),
-        buffer_size=options.memory,
-        learning_starts=options.warm_up,
-        batch_size=options.batch,
-        gamma=options.discount,
-        tau=options.smoothing,
-        train_freq=1,
-        gradient_steps=options.gradient_steps,
-        ent_coef="auto_0.01",
+        **_arguments(SAC, options, spent),
         policy_kwargs={
-            "net_arch": list(options.hidden),
+            "net_arch": list(options.net_arch),
             "activation_fn": Tanh,
             "optimizer_kwargs": {"fused": True},
         },
@@ -190,6 +177,15 @@ def make_sac(env: VecEnv, options: SacOptions, seed: int, spent: Callable[[], fl
     )
     model.set_logger(Logger(None, []))
     return model
+
+
+def _arguments(
+    learner: type[PPO | SAC], options: PpoOptions | SacOptions, spent: Callable[[], float]
+) -> dict[str, Any]:
+    """Hyperparameters that a learner takes under the same names; the learning rate falls."""
+    taken = inspect.signature(learner).parameters
+    same = {entry.name: getattr(options, entry.name) for entry in fields(options) if entry.name in taken}
+    return same | {"learning_rate": _falling(options.learning_rate, options.final_rate, spent)}
 
 
 def export(model: PPO | SAC, features: Features) -> Network:
@@ -222,7 +218,7 @@ def take_over(model: PPO | SAC, network: Network) -> None:
     if found != wanted or kinds != (squash, "hover", "tanh"):
         raise ValueError(
             f"the network has layers {found}, squash, commands and activation {kinds}, this training "
-            f"{wanted} and {(squash, 'hover', 'tanh')}: go on with the algorithm and the hidden layers that "
+            f"{wanted} and {(squash, 'hover', 'tanh')}: go on with the algorithm and the net_arch that "
             "made it"
         )
     with torch.no_grad():
@@ -253,7 +249,8 @@ def _updates(
     start: Network | None,
     bound: tuple[Multiplier, Probe] | None = None,
 ) -> Iterator[tuple[Progress, Network]]:
-    """Learn in pieces of `horizon` steps of all rows, each checked before it is handed out."""
+    """Learn in pieces of some steps of all rows, each checked before it is handed out."""
+    steps = options.n_steps if isinstance(options, PpoOptions) else options.progress_steps
     if start is not None:
         take_over(model, start)
     update = 0
@@ -263,7 +260,7 @@ def _updates(
             layer.requires_grad_(not held)
         update += 1
         try:
-            model.learn(flights.num_envs * options.horizon, reset_num_timesteps=False, log_interval=_NEVER)
+            model.learn(flights.num_envs * steps, reset_num_timesteps=False, log_interval=_NEVER)
         except ValueError as error:
             # Torch and the environment refuse what is not finite, each with words of its own.
             if _unsound(model) is None:
@@ -274,7 +271,7 @@ def _updates(
         tally = flights.tally()
         if bound is not None and isinstance(options, PpoLagrangianOptions) and spent() >= options.free:
             multiplier, probe = bound
-            multiplier.update(probe.share(model, options.horizon))
+            multiplier.update(probe.share(model, steps))
         yield Progress(update, model.num_timesteps, tally.reward), export(model, flights.features)
 
 
