@@ -161,7 +161,7 @@ def test_equal_seeds_give_equal_networks(algorithm, options):
 
 def test_a_network_with_other_layers_is_no_start():
     wrong, steps = still(task_of(HELIX)), iter([0.0, 1.0])
-    with pytest.raises(ValueError, match="give the same hidden sizes"):
+    with pytest.raises(ValueError, match="give the same net_arch"):
         next(dagger(training_options(HELIX, {}), DaggerOptions(expert="lqr"), 0, lambda: next(steps), wrong))
 
 

@@ -389,7 +389,7 @@ def test_equal_seeds_give_equal_runs(train, options):
             np.testing.assert_array_equal(W, V)
     assert not np.array_equal(runs[0][-1][1].weights[0], runs[2][-1][1].weights[0])
     assert [p.update for p, _ in runs[0]] == [1, 2, 3, 4, 5, 6]
-    assert runs[0][-1][0].steps == 6 * 8 * options.horizon
+    assert runs[0][-1][0].steps == 6 * 8 * getattr(options, "n_steps", 8)
 
 
 @pytest.mark.parametrize("options", [FormationOptions(vehicles=3), TargetTrackingOptions()])
