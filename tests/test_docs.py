@@ -17,6 +17,8 @@ from typing import NamedTuple
 import pytest
 
 from baselines.__main__ import main, make_parser
+from baselines.training.algorithms import ALGORITHMS
+from quad_envs.field_comments import field_comments
 from quad_envs.registration import TEAMS, TRACKING
 
 ROOT = pathlib.Path(__file__).parent.parent
@@ -165,6 +167,16 @@ def test_the_page_on_environments_gets_every_column_of_the_tables():
         assert re.search(rf"^\| `{name}` \|", text, re.MULTILINE), name
     row = next(line for line in text.splitlines() if line.startswith("| `effort`"))
     assert row.count("|") - row.count(r"\|") == 5  # bars of the mathematics end no cell
+
+
+def test_the_page_on_training_gets_every_hyperparameter_with_its_meaning():
+    page = ROOT / "docs" / "tutorial" / "training.md"
+    text = script("hooks").on_page_markdown(page.read_text(encoding="utf-8"))
+    for name, entry in ALGORITHMS.items():
+        table = text.split(f"### {name}\n")[1].split("###")[0]
+        for field, comment in field_comments(entry.options).items():
+            row = next(line for line in table.splitlines() if line.startswith(f"| `{field}` |"))
+            assert row.endswith(f"| {comment} |") and row.count("|") == 4
 
 
 def test_the_readme_can_be_read_in_a_few_minutes():
