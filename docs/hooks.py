@@ -2,7 +2,7 @@
 
 Equations become MathML when the site is built: `pymdownx.arithmatex` has marked them, their TeX escaped as
 HTML. The one script that the theme would take from the network is the copy in docs/vendor. And tables of what
-the code knows are written from it: the columns that evaluations have, the hyperparameters of the learners.
+the code knows are written from it: the columns of tables, the hyperparameters of the learners.
 """
 
 from __future__ import annotations
@@ -11,8 +11,6 @@ import html
 import re
 from typing import Any
 
-COLUMNS_HERE = "<!-- table: columns -->"
-HYPERPARAMETERS_HERE = "<!-- table: hyperparameters -->"
 _INLINE = re.compile(r'<span class="arithmatex">\\\((.*?)\\\)</span>', re.DOTALL)
 _DISPLAY = re.compile(r'<div class="arithmatex">\\\[(.*?)\\\]</div>', re.DOTALL)
 _SHIM, _OWN_SHIM = "https://unpkg.com/iframe-worker/shim", "vendor/iframe-worker.js"
@@ -37,6 +35,17 @@ def columns_table() -> str:
     return "\n".join(lines)
 
 
+def episode_table() -> str:
+    """The columns of an episode as a table, as Markdown."""
+    from baselines.evaluation.episode_columns import GROUPS
+
+    lines = ["| column | unit | |", "|---|---|---|"]
+    for group in GROUPS:
+        names = ", ".join(f"`{name}`" for name in group.names)
+        lines.append(f"| {names} | {group.unit} | {group.about} |")
+    return "\n".join(lines)
+
+
 def hyperparameter_tables() -> str:
     """What each learner lets choose, in Markdown, from the comments in its options."""
     from baselines.training.algorithms import ALGORITHMS
@@ -53,9 +62,16 @@ def hyperparameter_tables() -> str:
     return "\n".join(lines)
 
 
+_TABLES = {
+    "<!-- table: columns -->": columns_table,
+    "<!-- table: episode -->": episode_table,
+    "<!-- table: hyperparameters -->": hyperparameter_tables,
+}
+
+
 def on_page_markdown(markdown: str, **kwargs: Any) -> str:
-    """The page with its tables of what the code knows, where it has one."""
-    for mark, table in ((COLUMNS_HERE, columns_table), (HYPERPARAMETERS_HERE, hyperparameter_tables)):
+    """The page with its tables of what the code knows, where it has some."""
+    for mark, table in _TABLES.items():
         if mark in markdown:
             markdown = markdown.replace(mark, table())
     return markdown

@@ -160,11 +160,13 @@ def test_the_table_of_the_readme_has_the_numbers_of_the_results_page():
     assert README.read_text(encoding="utf-8") == script("summary").renewed(), "run: python docs/summary.py"
 
 
-def test_the_page_on_environments_gets_every_column_of_the_tables():
+def test_pages_get_every_column_of_the_tables():
     page = ROOT / "docs" / "contracts" / "environments.md"
     text = script("hooks").on_page_markdown(page.read_text(encoding="utf-8"))
     for name in ("quadratic_cost", "constraint_cost", "position_rms", "anees", "crashed", "left_model"):
         assert re.search(rf"^\| `{name}` \|", text, re.MULTILINE), name
+    files = (ROOT / "docs" / "contracts" / "files.md").read_text(encoding="utf-8")
+    assert "| `vx_ref`, `vy_ref`, `vz_ref` | m/s |" in script("hooks").on_page_markdown(files)
     row = next(line for line in text.splitlines() if line.startswith("| `effort`"))
     assert row.count("|") - row.count(r"\|") == 5  # bars of the mathematics end no cell
 

@@ -1,67 +1,100 @@
 """A flight as a table: one row per control period, columns by their names in the mathematics.
 
-| column | unit | content |
-|---|---|---|
-| t | s | k dt, k = 0..T |
-| x, y, z | m | position, NED: z points down |
-| u, v, w | m/s | velocity, body axes |
-| phi, theta, psi | rad | roll, pitch, yaw |
-| p, q, r | rad/s | body rates |
-| F1 ... F4 | N | rotor forces |
-| x_ref ... z_ref, vx_ref ... vz_ref | m, m/s | reference and its velocity, NED |
-| psi_ref | rad | reference heading |
-| F1_command ... F4_command | N | commanded from k to k + 1, as all below; nan in the last row |
-| reward, stage_cost | - | of the step |
-| constraint_cost | - | sum of violation / scale over the limits |
-| violated | 0, 1 | whether any limit was exceeded |
-| limit_... | SI | value minus limit, one column per row of `task.constraint_names` |
-| decision_time | s | wall time in `predict` per vehicle; nan where it was not measured |
-| others | | what a team adds, see `team_signals.py`; entries of arrays as name_0, name_0_1, ... |
+`GROUPS` says what they are. Behind them stand `limit_<name>` for each of `task.constraint_names`, value minus
+limit, SI, and what a team adds, see `team_signals.py`, entries of arrays as name_0, name_0_1, ... What
+belongs to the step from k to k + 1 is nan in the last row.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_envs.parameters import Array
+from quad_envs.parameters import ATTITUDE, FORCES, POSITION, RATES, VELOCITY, Array
 
-_FORCES = ("F1", "F2", "F3", "F4")
-_STATE = ("x", "y", "z", "u", "v", "w", "phi", "theta", "psi", "p", "q", "r", *_FORCES)
-_REFERENCE = ("x_ref", "y_ref", "z_ref", "vx_ref", "vy_ref", "vz_ref")
-_STEP = {
-    "reward": "rewards",
-    "stage_cost": "stage_costs",
-    "constraint_cost": "costs",
-    "violated": "violations",
-    "decision_time": "decision_times",
-}
+
+class Group(NamedTuple):
+    """Columns that are read together."""
+
+    names: tuple[str, ...]
+    unit: str  # "" if they have none
+    about: str
+    read: Callable[[Any], NDArray[Any]]  # an `Episode` -> (T+1 or T, number of names)
+
+
+def _plant(part: slice) -> Callable[[Any], NDArray[Any]]:
+    return lambda episode: np.asarray(episode.states[:, part])
+
+
+def _reference(part: slice) -> Callable[[Any], NDArray[Any]]:
+    return lambda episode: np.asarray(episode.references[:, part])
+
+
+def _step(field: str) -> Callable[[Any], NDArray[Any]]:
+    return lambda episode: np.asarray(getattr(episode, field))[:, None]
+
+
+def _time(episode: Any) -> Array:
+    return np.arange(len(episode.rewards) + 1.0)[:, None] * float(episode.task.dt)
+
+
+def _heading(episode: Any) -> Array:
+    return np.asarray(np.arctan2(episode.references[:, 6], episode.references[:, 7]))[:, None]
+
+
+_ROTORS = ("F1", "F2", "F3", "F4")
+_PLANT = (
+    Group(("x", "y", "z"), "m", "position, NED: z points down", _plant(POSITION)),
+    Group(("u", "v", "w"), "m/s", "velocity, body axes", _plant(VELOCITY)),
+    Group(("phi", "theta", "psi"), "rad", "roll, pitch, yaw", _plant(ATTITUDE)),
+    Group(("p", "q", "r"), "rad/s", "body rates", _plant(RATES)),
+    Group(_ROTORS, "N", "rotor forces", _plant(FORCES)),
+)
+_REFERENCE = (
+    Group(("x_ref", "y_ref", "z_ref"), "m", "reference, NED", _reference(POSITION)),
+    Group(("vx_ref", "vy_ref", "vz_ref"), "m/s", "its velocity, NED", _reference(VELOCITY)),
+    Group(("psi_ref",), "rad", "its heading", _heading),
+)
+_STEPS = (
+    Group(tuple(f"{name}_command" for name in _ROTORS), "N", "commands", lambda episode: episode.commands),
+    Group(("reward",), "", "of the step", _step("rewards")),
+    Group(("stage_cost",), "", "of the step, l", _step("stage_costs")),
+    Group(("constraint_cost",), "", "sum of violation / scale over the limits", _step("costs")),
+    Group(("violated",), "", "whether any limit was exceeded, 0 or 1", _step("violations")),
+    Group(("decision_time",), "s", "wall time in predict per vehicle", _step("decision_times")),
+)
+_TIME = Group(("t",), "s", "k dt, k = 0..T", _time)
+GROUPS = (_TIME, *_PLANT, *_REFERENCE, *_STEPS)
 
 
 def episode_columns(episode: Any) -> dict[str, Array]:
-    """Name -> (T+1,), the table above, of an `Episode`; what the environment does not show is left out."""
-    steps, task = len(episode.rewards), episode.task
-    found: dict[str, Array] = {"t": np.arange(steps + 1.0) * float(task.dt)}
-    if episode.states.shape[1] == len(_STATE):
-        found |= dict(zip(_STATE, episode.states.T, strict=True))
-    if len(episode.references) > steps:
-        found |= dict(zip(_REFERENCE, episode.references[:, :6].T, strict=True))
-        found["psi_ref"] = np.arctan2(episode.references[:, 6], episode.references[:, 7])
-    per_step: dict[str, NDArray[Any]] = {
-        f"{name}_command": values for name, values in zip(_FORCES, episode.commands.T, strict=True)
-    }
-    per_step |= {name: getattr(episode, field) for name, field in _STEP.items()}
-    limits = zip(task.constraint_names, episode.constraint_values.T, strict=True)
-    per_step |= {f"limit_{name}": values for name, values in limits}
-    per_step |= dict(_entries(episode.signals))
-    for name, values in per_step.items():
-        found[name] = np.append(np.asarray(values, dtype=np.float64), np.nan)
-    return found
+    """Name -> (T+1,), the columns of an `Episode`; what the environment does not show is left out."""
+    steps = len(episode.rewards)
+    shown = (
+        _TIME,
+        *(_PLANT if episode.states.shape[1] else ()),
+        *(_REFERENCE if len(episode.references) > steps else ()),
+        *_STEPS,
+    )
+    found: dict[str, NDArray[Any]] = {}
+    for group in shown:
+        found |= dict(zip(group.names, group.read(episode).T, strict=True))
+    limits = zip(episode.task.constraint_names, episode.constraint_values.T, strict=True)
+    found |= {f"limit_{name}": values for name, values in limits}
+    found |= dict(_entries(episode.signals))
+    return {name: _full(values, steps + 1) for name, values in found.items()}
+
+
+def _full(values: NDArray[Any], rows: int) -> Array:
+    """(rows,), nan behind what is shorter."""
+    out = np.full(rows, np.nan)
+    out[: len(values)] = values
+    return out
 
 
 def _entries(signals: Mapping[str, NDArray[Any]]) -> Iterator[tuple[str, NDArray[Any]]]:

@@ -1,7 +1,7 @@
 """Learned policies beside controllers: all training seeds of an algorithm are one contender.
 
 Each column stands for itself. The score alone is compared with statistics, since every flight has one; what a
-crash cuts short (cost, RMS) is a mean over flights, and empty where one crashed.
+crash cuts short (costs, RMS) is a mean over flights, and empty where one crashed.
 """
 
 from __future__ import annotations
