@@ -175,6 +175,8 @@ def test_a_paired_difference_needs_common_seeds():
         paired_difference([measure(flight(seed=1))], [measure(flight(seed=2))], "score")
     with pytest.raises(ValueError, match="column must be one of"):
         paired_difference([measure(flight())], [measure(flight())], "crashed")
+    with pytest.raises(ValueError, match="got 'cost'; it is called 'quadratic_cost' now"):
+        paired_difference([measure(flight())], [measure(flight())], "cost")
 
 
 def test_costs_are_the_sums_of_what_each_step_tells():

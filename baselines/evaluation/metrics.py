@@ -21,7 +21,7 @@ from quad_envs.parameters import POSITION, Array
 from quad_envs.tasks import TeamTask
 
 from .column import COUNTED, CUT_SHORT, FALLBACK
-from .columns import COLUMNS, Record, averaged, without_cut_short
+from .columns import COLUMNS, Record, averaged, renamed, without_cut_short
 from .episode import Episode
 from .team_metrics import by_flight, flight_values, has_team, measure_team
 
@@ -150,7 +150,9 @@ def paired_difference(ours: Sequence[Record], theirs: Sequence[Record], column: 
     """
     names = [entry.name for entry in averaged(team=True)]
     if column not in names:
-        raise ValueError(f"column must be one of {', '.join(names)}, got {column!r}")
+        (now,) = renamed({column: None})
+        hint = f"; it is called {now!r} now" if now != column else ""
+        raise ValueError(f"column must be one of {', '.join(names)}, got {column!r}{hint}")
     one, other = flight_values(ours, column), flight_values(theirs, column)
     seeds = dict.fromkeys(seed for seed in one if seed in other)
     if not seeds:
