@@ -14,8 +14,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
 from quad_envs._numba import kernel
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 
@@ -26,7 +24,7 @@ _SIZE = N_STATE + N_INPUT
 
 
 class RateWorkspace(NamedTuple):
-    """The problem over z = [x; u_prev] and its recursion; empty where changes have no weight."""
+    """The problem over z = [x; u_prev] and its recursion; see `carve_rate`."""
 
     A: Array  # (1 or N, 16, 16)
     B: Array  # (1 or N, 16, 4)
@@ -48,18 +46,50 @@ class RateWorkspace(NamedTuple):
     scratch: Array  # (RICCATI_SCRATCH, 16, 16)
 
 
-def make_rate_workspace(horizon: int, n_models: int, used: bool) -> RateWorkspace:
-    """Memory for a weight on changes; of no size unless it is used."""
-    N, M, k, n, m = horizon, n_models, 1, _SIZE, N_INPUT
-    if not used:
-        N, M, k, n, m = 0, 0, 0, 0, 0
-    shapes = {
-        "A": (M, n, n), "B": (M, n, m), "c": (N, n), "Q": (N, n, n), "Q_f": (n, n), "R": (m, m), "T": (m, m),
-        "x_0": (n,), "r": (N + k, n), "transposed": (M, n + m, n), "K": (N, m, n), "K_u": (N, m, n),
-        "A_cl": (N, n, n), "P_c": (N, n), "v": (N, m), "z": (N + k, n), "wide": (2, n, m * N),
-        "scratch": (RICCATI_SCRATCH, n, n),
-    }  # fmt: skip
-    return RateWorkspace(**{name: np.zeros(shape) for name, shape in shapes.items()})
+def rate_size(horizon: int, n_models: int) -> int:
+    """Numbers that `carve_rate` needs."""
+    N, M, n, m = horizon, n_models, _SIZE, N_INPUT
+    pairs, stages = M * (2 * n + 2 * m) * n, N * (2 * n * n + 2 * m * n + 2 * n + m) + 2 * n * (N + 1)
+    return pairs + stages + n * n + 2 * m * m + n + 2 * n * m * N + RICCATI_SCRATCH * n * n
+
+
+@kernel
+def _take(buffer: Array, start: int, blocks: int, rows: int, columns: int) -> Array:
+    """The next matrices of the buffer."""
+    return buffer[start : start + blocks * rows * columns].reshape(blocks, rows, columns)
+
+
+@kernel
+def carve_rate(buffer: Array, N: int, M: int) -> RateWorkspace:
+    """Views of the buffer: one array is unpacked at a call from Python instead of eighteen."""
+    n, m = _SIZE, N_INPUT
+    A = _take(buffer, 0, M, n, n)
+    i = A.size
+    B = _take(buffer, i, M, n, m)
+    i += B.size
+    transposed = _take(buffer, i, M, n + m, n)
+    i += transposed.size
+    square = _take(buffer, i, 2 * N + 1, n, n)
+    i += square.size
+    gains = _take(buffer, i, 2 * N, m, n)
+    i += gains.size
+    stages = _take(buffer, i, 2, N, n)
+    i += stages.size
+    points = _take(buffer, i, 2, N + 1, n)
+    i += points.size
+    small = _take(buffer, i, 2, m, m)
+    i += small.size
+    v = _take(buffer, i, 1, N, m)[0]
+    i += v.size
+    x_0 = buffer[i : i + n]
+    i += n
+    wide = _take(buffer, i, 2, n, m * N)
+    i += wide.size
+    scratch = _take(buffer, i, RICCATI_SCRATCH, n, n)
+    return RateWorkspace(
+        A, B, stages[0], square[:N], square[2 * N], small[0], small[1], x_0, points[0], transposed, gains[:N],
+        gains[N:], square[N : 2 * N], stages[1], v, points[1], wide, scratch,
+    )  # fmt: skip
 
 
 @kernel

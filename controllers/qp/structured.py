@@ -38,7 +38,7 @@ from .active_set import (
 )
 from .linalg import fill, transpose
 from .ocp import IntArray, OcpQp, rate_weight, validate
-from .rate_weight import RateWorkspace, make_rate_workspace, rate_pass, rate_plan
+from .rate_weight import carve_rate, rate_pass, rate_plan, rate_size
 from .riccati import RICCATI_SCRATCH, optimal_plan, riccati_pass, step_plan
 from .solution import Multipliers, Solution, Status
 from .stationarity import REFINED, STATIONARY, is_mild, lagrangian_gradient
@@ -73,7 +73,7 @@ class Workspace(NamedTuple):
     state: ByteArray  # (16N + 2K,), of every row at the end
     guess: ByteArray  # (16N + 2K,), of every row, to start from
     error: Array  # (2,), left after refinement: by how much another would move an input, and gaps of rows
-    rate: RateWorkspace  # of a weight on changes; may be empty
+    rate: Array  # of a weight on changes, see `carve_rate`; may be empty
 
 
 def make_workspace(horizon: int, n_rows: int, n_models: int, weighs_changes: bool = False) -> Workspace:
@@ -117,7 +117,7 @@ def make_workspace(horizon: int, n_rows: int, n_models: int, weighs_changes: boo
         state=np.zeros(4 * nv + 2 * n_rows, dtype=np.int8),
         guess=np.zeros(4 * nv + 2 * n_rows, dtype=np.int8),
         error=np.zeros(2),
-        rate=make_rate_workspace(N, n_models, weighs_changes),
+        rate=np.zeros(rate_size(N, n_models) if weighs_changes else 0),
     )
 
 
@@ -216,7 +216,8 @@ def _recursion(
     for j in range(A.shape[0]):
         transpose(A[j], transposed[j, :n])
         transpose(B[j], transposed[j, n:])
-    rate_pass(A, B, c, Q, R, Q_f, x_0, u_last, r, R_rate, ws.D, ws.rate)
+    rate = carve_rate(ws.rate, c.shape[0], ws.transposed.shape[0])
+    rate_pass(A, B, c, Q, R, Q_f, x_0, u_last, r, R_rate, ws.D, rate)
 
 
 @kernel
@@ -334,7 +335,7 @@ def _solve_rows(
     u, x, transposed = ws.u, ws.x, ws.transposed[: A.shape[0]]
     J_T, R_T = ws.factors[0], ws.factors[1]
     if R_rate.shape[0] > 0:
-        rate = ws.rate
+        rate = carve_rate(ws.rate, c.shape[0], ws.transposed.shape[0])
         inverse_factor(rate.K_u, ws.D, rate.A_cl, rate.B[: B.shape[0]], False, J_T, rate.wide)
     else:
         inverse_factor(ws.K, ws.D, ws.A_cl, B, stationary, J_T, ws.wide)
@@ -428,7 +429,7 @@ def solve_structured(
         ws.u.shape[0] != N
         or ws.spans.shape[0] < max(K, normals.shape[0])
         or ws.transposed.shape[0] < A.shape[0]
-        or ws.rate.R.shape[0] < R_rate.shape[0]
+        or (ws.rate.size == 0 and R_rate.shape[0] > 0)
     ):
         raise ValueError(
             "the workspace does not fit the problem: make it with its horizon, rows, pairs and weights"
@@ -453,7 +454,8 @@ def solve_structured(
     status, iterations = NOT_FINITE, 0
     for attempt in range(3):
         if R_rate.shape[0] > 0:
-            rate_plan(A.shape[0], Q.shape[0], ws.D, ws.rate, u, x)
+            rate = carve_rate(ws.rate, N, ws.transposed.shape[0])
+            rate_plan(A.shape[0], Q.shape[0], ws.D, rate, u, x)
         else:
             optimal_plan(
                 B, c, Q, Q_f, x_0, r, stationary, transposed, ws.K, ws.D, ws.A_cl, ws.P_c, u, x, ws.scratch
@@ -544,10 +546,10 @@ class StructuredSolver:
         ws = self._workspace
         if ws is not None and len(ws.u) == horizon:
             fits = len(ws.spans) >= n_rows and len(ws.transposed) >= n_models
-            if fits and len(ws.rate.R) >= weighs_changes:
+            if fits and (ws.rate.size > 0 or not weighs_changes):
                 return ws
             n_rows, n_models = max(n_rows, len(ws.spans)), max(n_models, len(ws.transposed))
-            weighs_changes = weighs_changes or len(ws.rate.R) > 0
+            weighs_changes = weighs_changes or ws.rate.size > 0
         self._workspace = make_workspace(horizon, n_rows, n_models, weighs_changes)
         return self._workspace
 
