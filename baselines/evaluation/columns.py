@@ -7,6 +7,7 @@ from it: they have the columns in this order.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Annotated, Any, NamedTuple, get_type_hints
@@ -164,6 +165,13 @@ class Record(NamedTuple):
     iterations_max: Annotated[
         int, Column("Iterations", "", "most of the solver in a decision", LESS | MOST | UNSEEN)
     ]
+
+    @property
+    def cost(self) -> float:
+        """`quadratic_cost` by its name of before, with a warning: `info["cost"]` is the constraint signal."""
+        text = 'Record.cost is now quadratic_cost; constraint_cost is the sum of info["cost"]'
+        warnings.warn(text, DeprecationWarning, stacklevel=2)
+        return self.quadratic_cost
 
     def row(self) -> dict[str, Any]:
         """Flat form for tables: `worst_violation` becomes one column per constraint."""
