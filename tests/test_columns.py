@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from baselines import run_benchmark
+from baselines import evaluate, run_benchmark
 from baselines.__main__ import main
 from baselines.evaluation.column import COUNTED, LARGEST
 from baselines.evaluation.columns import COLUMNS, Record, read_record, shown
@@ -115,3 +115,9 @@ def test_counts_are_sums_and_no_means():
     counted = {name for name, column in COLUMNS.items() if column.has(COUNTED)}
     assert {"crashed", "left_model"} <= counted <= {*Record._fields, "fallbacks"}
     assert not any(COLUMNS[name].averaged for name in counted)
+
+
+def test_a_record_answers_to_the_name_of_before_with_a_warning():
+    evaluation = evaluate("lqr", HELIX, episodes=1)
+    with pytest.warns(DeprecationWarning, match="now quadratic_cost"):
+        assert evaluation.records[0].cost == evaluation.records[0].quadratic_cost
