@@ -9,6 +9,7 @@ from .feedback.sdre import Lqr, Sdre
 from .model import hover_pair, sdc_pair
 from .mpc.exact import ExactNmpc
 from .mpc.lmpc import LinearMPC
+from .mpc.options import LmpcOptions, NmpcOptions, SdcOptions
 from .mpc.sdc import SdcNmpc
 from .qp.ocp import OcpQp, StateRows
 from .qp.riccati import dare, lqr_gain
@@ -27,9 +28,12 @@ __all__ = [
     "Fallback",
     "FeedbackLinearization",
     "LinearMPC",
+    "LmpcOptions",
     "Lqr",
+    "NmpcOptions",
     "OcpQp",
     "SdcNmpc",
+    "SdcOptions",
     "Sdre",
     "StateRows",
     "TargetEstimate",

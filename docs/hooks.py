@@ -2,13 +2,15 @@
 
 Equations become MathML when the site is built: `pymdownx.arithmatex` has marked them, their TeX escaped as
 HTML. The one script that the theme would take from the network is the copy in docs/vendor. And tables of what
-the code knows are written from it: the columns of tables, the hyperparameters of the learners.
+the code knows are written from it: the columns of tables, the hyperparameters of the learners, the
+options of the MPCs.
 """
 
 from __future__ import annotations
 
 import html
 import re
+from dataclasses import fields
 from typing import Any
 
 _INLINE = re.compile(r'<span class="arithmatex">\\\((.*?)\\\)</span>', re.DOTALL)
@@ -54,18 +56,37 @@ def hyperparameter_tables() -> str:
 
     lines = []
     for name, entry in ALGORITHMS.items():
-        comments = field_comments(entry.options)
-        lines += [f"### {name}", "", "| hyperparameter | default | |", "|---|---|---|"]
+        lines += [f"### {name}", ""]
         values = plain_options(hyperparameters(name, ""))
-        lines += [f"| `{key}` | `{value!r}` | {comments[key]} |" for key, value in values.items()]
-        lines.append("")
+        lines += [*_rows("hyperparameter", values, field_comments(entry.options)), ""]
     return "\n".join(lines)
+
+
+def mpc_options_table() -> str:
+    """What each MPC lets choose, in Markdown, those that all have first."""
+    from controllers.mpc.options import LmpcOptions, MpcOptions, NmpcOptions, SdcOptions
+    from quad_envs.field_comments import field_comments
+
+    lines = []
+    shared = {field.name for field in fields(MpcOptions)}
+    for kind in (MpcOptions, LmpcOptions, SdcOptions, NmpcOptions):
+        own = [f for f in fields(kind) if kind is MpcOptions or f.name not in shared]
+        values = {field.name: field.default for field in own}
+        lines += [f"#### {kind.__name__}", "", *_rows("option", values, field_comments(kind)), ""]
+    return "\n".join(lines)
+
+
+def _rows(what: str, values: dict[str, Any], comments: dict[str, str]) -> list[str]:
+    """A table of fields, their defaults and comments."""
+    rows = [f"| `{key}` | `{value!r}` | {comments[key]} |" for key, value in values.items()]
+    return [f"| {what} | default | |", "|---|---|---|", *rows]
 
 
 _TABLES = {
     "<!-- table: columns -->": columns_table,
     "<!-- table: episode -->": episode_table,
     "<!-- table: hyperparameters -->": hyperparameter_tables,
+    "<!-- table: mpc options -->": mpc_options_table,
 }
 
 

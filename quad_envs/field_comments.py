@@ -12,7 +12,7 @@ from typing import Any
 
 
 def field_comments(kind: type[Any]) -> dict[str, str]:
-    """The comment behind each field of a dataclass, inherited ones included.
+    """The comment behind each field of a dataclass, or on its further lines, inherited ones included.
 
     Args:
         kind: A dataclass.
@@ -37,7 +37,7 @@ def _own_comments(kind: type[Any]) -> dict[str, str]:
     behind = {
         token.start[0]: token.string.lstrip("# ")
         for token in tokenize.generate_tokens(io.StringIO(source).readline)
-        if token.type == tokenize.COMMENT and token.line[: token.start[1]].strip()
+        if token.type == tokenize.COMMENT
     }
     return {
         node.target.id: " ".join(

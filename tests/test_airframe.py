@@ -104,7 +104,7 @@ def test_every_law_keeps_to_the_limit_of_each_rotor_and_reaches_it(make, frame):
 @pytest.mark.parametrize("solver", ["structured", "osqp"])
 def test_both_solvers_have_the_box_of_each_rotor(solver):
     task = Task(params=QuadrotorParams(frame="x"), limits=Limits(kappa=UNEVEN))
-    law, plant, window = LinearMPC(task, 10, solver=solver), np.zeros((1, 16)), np.zeros((1, 11, 8))
+    law, plant, window = LinearMPC(task, horizon=10, solver=solver), np.zeros((1, 16)), np.zeros((1, 11, 8))
     plant[0, :3], plant[0, 12:], window[..., 7] = (2.0, -1.0, 4.0), 1.96, 1.0
     memory = np.zeros((1, law.memory_size))
     decision = law.decide(plant, window, np.full((1, 4), 1.96), np.zeros((1, 6)), memory)

@@ -18,7 +18,7 @@ from processes import start_command
 from baselines.__main__ import COMMANDS, main
 from baselines.cli.commands import _resume
 from baselines.cli.options import BenchmarkOptions, read_assignments
-from baselines.policies.registry import TEAM_POLICIES, TRACKING_POLICIES
+from baselines.policies.registry import TEAM_POLICIES, TRACKING_POLICIES, policy_comments, policy_options
 from baselines.sweeps.sweep import REPORTED
 from quad_envs.registration import TEAMS, TRACKING
 
@@ -247,6 +247,15 @@ def test_list_names_every_environment_and_policy(capsys):
 def test_list_shows_the_options_of_a_name(capsys, name, option):
     assert main(["list", name, "--json"]) == 0
     assert option in json.loads(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("name", ["lmpc", "sdc-nmpc", "nmpc"])
+def test_list_shows_what_each_option_of_an_mpc_means(capsys, name):
+    assert main(["list", name]) == 0
+    printed = capsys.readouterr().out.splitlines()[1:]
+    assert [line.split()[0] for line in printed] == list(policy_options(name))
+    for line, meaning in zip(printed, policy_comments(name).values(), strict=True):
+        assert meaning and line.endswith(f"# {meaning}")
 
 
 def test_benchmark_prints_tables_and_says_where_the_results_are(capsys, tmp_path):

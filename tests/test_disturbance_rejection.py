@@ -67,7 +67,7 @@ def test_revealed_disturbance_leaves_no_offset(name):
 @pytest.mark.parametrize("solver", ["structured", "osqp"])
 def test_revealed_disturbance_moves_the_box_and_not_the_command_limits(solver):
     decision = decide_once(
-        LinearMPC(TASK, 10, solver=solver), at_rest(), disturbance=np.array([0.5, 0.5, 0, 0, 0, 6.0])
+        LinearMPC(TASK, horizon=10, solver=solver), at_rest(), disturbance=np.array([0.5, 0.5, 0, 0, 0, 6.0])
     )
     assert (decision.command >= 0.0).all() and (decision.command <= TASK.force_max).all()
     assert decision.fallback[0] == 0

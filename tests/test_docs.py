@@ -18,6 +18,7 @@ import pytest
 
 from baselines.__main__ import main, make_parser
 from baselines.training.algorithms import ALGORITHMS
+from controllers import LmpcOptions, NmpcOptions, SdcOptions
 from quad_envs.field_comments import field_comments
 from quad_envs.registration import TEAMS, TRACKING
 
@@ -179,6 +180,15 @@ def test_the_page_on_training_gets_every_hyperparameter_with_its_meaning():
         for field, comment in field_comments(entry.options).items():
             row = next(line for line in table.splitlines() if line.startswith(f"| `{field}` |"))
             assert row.endswith(f"| {comment} |") and row.count("|") == 4
+
+
+def test_the_page_on_controllers_gets_every_option_of_the_mpcs_with_its_meaning():
+    page = ROOT / "docs" / "api" / "controllers.md"
+    text = script("hooks").on_page_markdown(page.read_text(encoding="utf-8"))
+    for kind in (LmpcOptions, SdcOptions, NmpcOptions):
+        for field, comment in field_comments(kind).items():
+            rows = [line for line in text.splitlines() if line.startswith(f"| `{field}` |")]
+            assert comment and any(line.endswith(f"| {comment} |") and line.count("|") == 4 for line in rows)
 
 
 def test_the_readme_can_be_read_in_a_few_minutes():

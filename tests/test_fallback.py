@@ -19,8 +19,8 @@ LAST = np.array([1.5, 2.4, 1.0, 2.0])
 MPCS = {
     "lmpc": LinearMPC,
     "sdc": SdcNmpc,
-    "sdc-sdre": lambda task, horizon, **options: SdcNmpc(task, horizon, terminal_weight="sdre", **options),
-    "sdc-pass": lambda task, horizon, **options: SdcNmpc(task, horizon, relinearisations=1, **options),
+    "sdc-sdre": lambda task, **options: SdcNmpc(task, terminal_weight="sdre", **options),
+    "sdc-pass": lambda task, **options: SdcNmpc(task, relinearisations=1, **options),
     "rti": ExactNmpc,
 }
 
@@ -38,8 +38,8 @@ def assert_flyable(command, last, task):
 
 @pytest.mark.parametrize("solver", ["structured", "osqp"])
 def test_contradicting_hard_rows_are_relaxed(mpc, solver):
-    hard = mpc(TIGHT, N, soft_weight=np.inf, solver=solver)
-    soft = mpc(TIGHT, N, soft_weight=1e4, solver="structured")
+    hard = mpc(TIGHT, horizon=N, soft_weight=np.inf, solver=solver)
+    soft = mpc(TIGHT, horizon=N, soft_weight=1e4, solver="structured")
     decision, expected = decide_once(hard, FAST, last=LAST), decide_once(soft, FAST, last=LAST)
     assert decision.fallback[0] == Fallback.RELAXED
     assert expected.fallback[0] == Fallback.NONE
@@ -50,9 +50,9 @@ def test_contradicting_hard_rows_are_relaxed(mpc, solver):
 
 def test_without_an_answer_the_previous_plan_is_flown_on(mpc):
     """Stiff rows: softer ones are solved in a single step from the working set of the decision before."""
-    good = decide_once(mpc(TIGHT, N, soft_weight=1e3), FAST, last=LAST)
+    good = decide_once(mpc(TIGHT, horizon=N, soft_weight=1e3), FAST, last=LAST)
     plan = plan_of(good, N) + HOVER
-    stopped = mpc(TIGHT, N, soft_weight=1e3, iteration_limit=1)
+    stopped = mpc(TIGHT, horizon=N, soft_weight=1e3, iteration_limit=1)
     once = decide_once(stopped, FAST, last=good.command[0], memory=good.memory[0])
     assert once.fallback[0] == Fallback.PREVIOUS_PLAN
     np.testing.assert_allclose(once.command[0], plan[1], atol=1e-9)
@@ -63,7 +63,7 @@ def test_without_an_answer_the_previous_plan_is_flown_on(mpc):
 
 
 def test_previous_plan_is_clipped_to_rate_and_box(mpc):
-    controller = mpc(TIGHT, N, iteration_limit=1)
+    controller = mpc(TIGHT, horizon=N, iteration_limit=1)
     memory = np.zeros(controller.memory_size)
     memory[0], memory[1 : 1 + 4 * N] = 1.0, 9.0
     decision = decide_once(controller, FAST, last=LAST, memory=memory)
@@ -72,7 +72,7 @@ def test_previous_plan_is_clipped_to_rate_and_box(mpc):
 
 
 def test_without_a_plan_the_unconstrained_one_is_clipped():
-    decision = decide_once(LinearMPC(TIGHT, N, iteration_limit=1), FAST, last=LAST)
+    decision = decide_once(LinearMPC(TIGHT, horizon=N, iteration_limit=1), FAST, last=LAST)
     wanted = decide_once(Lqr(Task()), FAST).command[0]  # unlimited
     assert decision.fallback[0] == Fallback.CLIPPED_SDRE
     np.testing.assert_allclose(
@@ -82,7 +82,7 @@ def test_without_a_plan_the_unconstrained_one_is_clipped():
 
 
 def test_clipped_sdre_is_flyable_for_every_flavour(mpc):
-    decision = decide_once(mpc(TIGHT, N, iteration_limit=1), FAST, last=LAST)
+    decision = decide_once(mpc(TIGHT, horizon=N, iteration_limit=1), FAST, last=LAST)
     assert decision.fallback[0] == Fallback.CLIPPED_SDRE
     assert_flyable(decision.command[0], LAST, TIGHT)
 
@@ -90,7 +90,7 @@ def test_clipped_sdre_is_flyable_for_every_flavour(mpc):
 def test_hover_is_the_last_resort(mpc):
     plant = at_rest()
     plant[3:6] = plant[9:12] = 1e308  # finite, but no number follows from it
-    controller = mpc(TIGHT, N)
+    controller = mpc(TIGHT, horizon=N)
     decision = decide_once(controller, plant, last=LAST)
     assert decision.fallback[0] == Fallback.HOVER
     np.testing.assert_allclose(decision.command[0], np.clip(HOVER, LAST - 0.25, LAST + 0.25))
@@ -99,11 +99,13 @@ def test_hover_is_the_last_resort(mpc):
 
 
 def test_a_failure_resets_the_guess_of_the_exact_nmpc():
-    good = decide_once(ExactNmpc(TIGHT, N), FAST, last=LAST)
-    failed = decide_once(ExactNmpc(TIGHT, N, iteration_limit=1), FAST, last=LAST, memory=good.memory[0])
+    good = decide_once(ExactNmpc(TIGHT, horizon=N), FAST, last=LAST)
+    failed = decide_once(
+        ExactNmpc(TIGHT, horizon=N, iteration_limit=1), FAST, last=LAST, memory=good.memory[0]
+    )
     assert failed.fallback[0] == Fallback.PREVIOUS_PLAN
-    fresh = decide_once(ExactNmpc(TIGHT, N), FAST, last=LAST)
-    after = decide_once(ExactNmpc(TIGHT, N), FAST, last=LAST, memory=failed.memory[0])
+    fresh = decide_once(ExactNmpc(TIGHT, horizon=N), FAST, last=LAST)
+    after = decide_once(ExactNmpc(TIGHT, horizon=N), FAST, last=LAST, memory=failed.memory[0])
     np.testing.assert_array_equal(after.command, fresh.command)
 
 

@@ -41,7 +41,7 @@ def test_the_hover_model_predicts_the_position_of_a_tilted_vehicle_from_its_iner
     """Climbing straight at 3 m/s, rolled or not: the first step is straight but for what the roll pushes."""
     plant = at_rest(Theta=(roll, 0.0, psi))
     plant[3:6] = rotation_body_from_inertial(plant[6:9]) @ [0.0, 0.0, -3.0]
-    mpc = LinearMPC(TASK, 10)
+    mpc = LinearMPC(TASK, horizon=10)
     arguments = plant, window(rest, 0, 10), np.full(4, TASK.hover_force), np.zeros(6)
     qp = mpc.problem(*arguments, np.zeros(mpc.memory_size))
     np.testing.assert_allclose(qp.x_0[3:6], [0.0, 0.0, -3.0], atol=1e-12)
@@ -58,7 +58,7 @@ def test_the_dissertations_frame_and_the_other_references_keep_the_body_velocity
         {"velocity_reference": "attitude"},
         {"velocity_reference": "heading"},
     ):
-        mpc = LinearMPC(TASK, 5, **options)
+        mpc = LinearMPC(TASK, horizon=5, **options)
         arguments = plant, window(rest, 0, 5), np.full(4, TASK.hover_force), np.zeros(6)
         qp = mpc.problem(*arguments, np.zeros(mpc.memory_size))
         np.testing.assert_array_equal(qp.x_0[3:6], plant[3:6])
@@ -114,18 +114,18 @@ def test_a_limit_on_the_velocity_just_above_what_the_helix_needs_is_kept(name):
 
 
 def test_present_axes_have_no_other_factorisation():
-    assert SdcNmpc(TASK, 5).options.velocity_reference == "present"
-    assert SdcNmpc(TASK, 5, alpha=0.5).options.velocity_reference == "heading"
-    assert SdcNmpc(TASK, 5, frame="hover").options.velocity_reference == "heading"
+    assert SdcNmpc(TASK, horizon=5).options.axes() == "present"
+    assert SdcNmpc(TASK, horizon=5, alpha=0.5).options.axes() == "heading"
+    assert SdcNmpc(TASK, horizon=5, frame="hover").options.axes() == "heading"
     with pytest.raises(ValueError, match="'present' leaves out"):
-        SdcNmpc(TASK, 5, alpha=0.5, velocity_reference="present")
+        SdcNmpc(TASK, horizon=5, alpha=0.5, velocity_reference="present")
 
 
 def test_at_a_level_attitude_the_axes_are_one():
     plant, rows = at_rest(p=(1.0, -0.5, 0.3)), window(rest, 0, 10)
     plant[3:6] = 0.5, -0.2, 0.1
     level, body = (
-        decide_once(LinearMPC(TASK, 10, velocity_reference=axes), plant, rows).command
+        decide_once(LinearMPC(TASK, horizon=10, velocity_reference=axes), plant, rows).command
         for axes in ("level", "attitude")
     )
     np.testing.assert_array_equal(level, body)

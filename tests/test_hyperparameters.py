@@ -179,14 +179,17 @@ class Above:
 class Below(Above):
     """Changes one, adds one."""
 
-    d: float = 0.5  # the last
+    d: float = (
+        0.5  # the last
+        # of four
+    )
     a: int = 2  # changed
 
 
 def test_comments_of_fields_are_read_from_the_source():
     first = {"a": "the first; # and a second sign", "b": "", "c": "one and two"}
     assert field_comments(Above) == first
-    assert field_comments(Below) == first | {"a": "changed", "d": "the last"}
+    assert field_comments(Below) == first | {"a": "changed", "d": "the last of four"}
     assert list(field_comments(Below)) == ["a", "b", "c", "d"]
 
 

@@ -11,7 +11,7 @@ from baselines import evaluate, make_policy
 from baselines.evaluation.metrics import totals
 from controllers import ExactNmpc, Fallback, LinearMPC, SdcNmpc
 from controllers.mpc.kernels import FROZEN_SPAN, left_model
-from controllers.mpc.mpc import EXACT_TILT, PLAN_TILT
+from controllers.mpc.options import EXACT_TILT, PLAN_TILT
 
 N = 15
 HELIX = "quad/HelixTracking-v0"
@@ -45,7 +45,7 @@ def test_the_kernel_agrees_with_its_definition_over_random_plans():
 @pytest.mark.parametrize("mpc", MPCS)
 def test_a_state_tilted_beyond_the_model_counts_and_hover_does_not(mpc, solver):
     for tilt, expected in ((0.0, 0), (1.1, 1)):
-        decision = decide_once(mpc(TASK, N, solver=solver), at_rest(Theta=(tilt, 0.0, 0.0)))
+        decision = decide_once(mpc(TASK, horizon=N, solver=solver), at_rest(Theta=(tilt, 0.0, 0.0)))
         assert decision.left_model.tolist() == [expected]
 
 
@@ -55,7 +55,7 @@ def test_a_frozen_pair_that_a_plan_turns_away_from_counts_until_the_model_is_tak
     plant, Q = at_rest(p=(-2.5, 0.0, 0.0)), np.r_[np.full(3, 30.0), np.ones(9)]
     counts = []
     for passes in (0, 4):
-        mpc = SdcNmpc(TASK, N, relinearisations=passes, Q=Q, solver=solver)
+        mpc = SdcNmpc(TASK, horizon=N, relinearisations=passes, Q=Q, solver=solver)
         counts.append(decide_once(mpc, plant).left_model[0])
     assert counts == [1, 0]
 
@@ -64,13 +64,13 @@ def test_the_hover_model_counts_a_heading_far_from_its_own_in_the_frame_of_the_d
     rows = window(helix, 0, N, psi=2.0)
     plant = at_rest(Theta=(0.0, 0.0, 2.0))
     for frame, expected in (("hover", 1), ("heading", 0)):
-        assert decide_once(LinearMPC(TASK, N, frame=frame), plant, rows).left_model[0] == expected
+        assert decide_once(LinearMPC(TASK, horizon=N, frame=frame), plant, rows).left_model[0] == expected
 
 
 def test_without_a_plan_of_its_own_a_decision_has_its_state_alone():
-    mpc = LinearMPC(TASK, N, soft_weight=np.inf, iteration_limit=1, plan_tilt=0.3)
+    mpc = LinearMPC(TASK, horizon=N, soft_weight=np.inf, iteration_limit=1, plan_tilt=0.3)
     far = at_rest(p=(-5.0, 4.0, 1.0))
-    kept = decide_once(LinearMPC(TASK, N), at_rest())
+    kept = decide_once(LinearMPC(TASK, horizon=N), at_rest())
     decision = decide_once(mpc, far, last=np.full(4, HOVER), memory=kept.memory[0])
     assert decision.fallback[0] == Fallback.PREVIOUS_PLAN
     assert decision.left_model[0] == 0

@@ -24,7 +24,7 @@ from flights import (
     window,
 )
 
-from controllers import ExactNmpc, LinearMPC, Lqr, SdcNmpc
+from controllers import ExactNmpc, LinearMPC, LmpcOptions, Lqr, NmpcOptions, SdcNmpc, SdcOptions
 from quad_envs.parameters import Limits, Weights
 from quad_envs.tasks import Task
 
@@ -49,6 +49,29 @@ def flavour(request):
 
 def first_input(controller, plant):
     return decide_once(controller, plant).command[0] - HOVER
+
+
+@pytest.mark.parametrize(
+    ("mpc", "kind"), [(LinearMPC, LmpcOptions), (SdcNmpc, SdcOptions), (ExactNmpc, NmpcOptions)]
+)
+def test_options_are_a_value_whose_fields_keywords_replace(mpc, kind):
+    chosen = kind(horizon=10, soft_weight=7.0)
+    assert mpc(TASK, chosen, horizon=5).options == kind(horizon=5, soft_weight=7.0)
+    assert mpc(TASK, horizon=10, soft_weight=7.0).options == mpc(TASK, chosen).options == chosen
+    with pytest.raises(TypeError, match=r"field of \w+Options: 'horizn'; did you mean 'horizon'\?"):
+        mpc(TASK, horizn=10)
+    with pytest.raises(TypeError, match=r"options must be \w+Options, got 10; .* horizon=25"):
+        mpc(TASK, 10)
+    with pytest.raises(AttributeError):
+        chosen.horizon = 20
+    with pytest.raises(ValueError, match="soft_weight"):
+        mpc(TASK, chosen, soft_weight=-1.0)
+    assert pickle.loads(pickle.dumps(chosen)) == chosen
+
+
+def test_options_of_one_mpc_are_refused_by_another():
+    with pytest.raises(TypeError, match="must be SdcOptions, got LmpcOptions"):
+        SdcNmpc(TASK, LmpcOptions())
 
 
 def test_lmpc_plan_of_the_published_problem():
@@ -87,7 +110,9 @@ def test_sdc_first_input_of_the_published_problem(options, expected):
 def test_unconstrained_lmpc_is_lqr_whatever_the_horizon(horizon):
     plant = at_rest((0.3, -0.2, 0.1), (0.05, -0.02, 0.03))
     expected = decide_once(Lqr(TASK), plant).command
-    np.testing.assert_allclose(decide_once(LinearMPC(TASK, horizon), plant).command, expected, atol=1e-11)
+    np.testing.assert_allclose(
+        decide_once(LinearMPC(TASK, horizon=horizon), plant).command, expected, atol=1e-11
+    )
 
 
 def test_position_and_heading_of_vehicle_and_reference_do_not_matter(flavour):
@@ -195,7 +220,7 @@ def test_position_box_is_kept_at_any_heading(flavour):
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: LinearMPC(TASK, 0), "horizon"),
+        (lambda: LinearMPC(TASK, horizon=0), "horizon"),
         (lambda: LinearMPC(TASK, solver="qpoases"), "'structured', 'osqp'"),
         (lambda: LinearMPC(TASK, frame="body"), "'heading', 'hover'"),
         (lambda: LinearMPC(TASK, velocity_reference="x"), "'level', 'heading', 'attitude'"),

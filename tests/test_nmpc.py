@@ -206,7 +206,7 @@ def test_converged_plan_is_that_of_ipopt(velocity_error, limits, rate):
     rows = turning_window(horizon, rate=rate)
     P = dare(*hover_pair(task.params, DT), np.eye(12), np.eye(4))
     last = np.full(4, HOVER)
-    controller = ExactNmpc(task, horizon, passes=100, velocity_error=velocity_error, frame="hover")
+    controller = ExactNmpc(task, horizon=horizon, passes=100, velocity_error=velocity_error, frame="hover")
     plan = plan_of(decide_once(controller, STATE, rows, last), horizon)
     expected = ipopt_plan(STATE[:12], with_turn_rates(rows, DT), last, task, horizon, velocity_error, P)
     np.testing.assert_allclose(plan, expected, atol=1e-5)

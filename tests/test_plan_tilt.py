@@ -21,11 +21,11 @@ FAR = at_rest((5.0, 0.0, 0.0))
 def test_a_plan_that_would_tilt_too_far_is_made_again_within_the_tilt(flavour):
     """The plan is that of an MPC whose task has the same limit."""
     chosen = 0.5
-    free = decide_once(flavour(Task(), 15, Q=HEAVY, plan_tilt=np.inf), FAR)
-    kept = decide_once(flavour(Task(), 15, Q=HEAVY, plan_tilt=chosen), FAR)
+    free = decide_once(flavour(Task(), horizon=15, Q=HEAVY, plan_tilt=np.inf), FAR)
+    kept = decide_once(flavour(Task(), horizon=15, Q=HEAVY, plan_tilt=chosen), FAR)
+    bounded = Task(limits=Limits(tilt=chosen))
     own = decide_once(
-        flavour(Task(limits=Limits(tilt=chosen)), 15, Q=HEAVY, soft_weight=1e4, margin=0.0, plan_tilt=np.inf),
-        FAR,
+        flavour(bounded, horizon=15, Q=HEAVY, soft_weight=1e4, margin=0.0, plan_tilt=np.inf), FAR
     )
     free, kept, own = (plan_of(decision, 15) for decision in (free, kept, own))
     assert np.abs(free - kept).max() > 1e-3
@@ -35,7 +35,8 @@ def test_a_plan_that_would_tilt_too_far_is_made_again_within_the_tilt(flavour):
 @pytest.mark.parametrize("flavour", FLAVOURS)
 def test_a_plan_that_stays_level_is_the_one_without_the_rows(flavour):
     free, kept = (
-        decide_once(flavour(Task(), 15, plan_tilt=tilt), at_rest((0.3, -0.2, 0.1))) for tilt in (np.inf, 0.8)
+        decide_once(flavour(Task(), horizon=15, plan_tilt=tilt), at_rest((0.3, -0.2, 0.1)))
+        for tilt in (np.inf, 0.8)
     )
     np.testing.assert_array_equal(free.command, kept.command)
 
@@ -44,7 +45,7 @@ def test_a_plan_that_stays_level_is_the_one_without_the_rows(flavour):
 def test_both_solvers_keep_to_the_tilt(flavour):
     """OSQP stops at residuals of 1e-5."""
     exact, approximate = (
-        decide_once(flavour(Task(), 10, Q=[10.0] * 3 + [0.1] * 9, solver=solver), FAR).command
+        decide_once(flavour(Task(), horizon=10, Q=[10.0] * 3 + [0.1] * 9, solver=solver), FAR).command
         for solver in ("structured", "osqp")
     )
     np.testing.assert_allclose(approximate, exact, atol=1e-2)
@@ -73,7 +74,7 @@ def test_relinearisations_are_auto_or_a_whole_number(passes):
 def test_by_itself_sdc_nmpc_relinearises_where_the_plan_turns_far_and_only_there():
     for plant, passes in ((at_rest((0.01, 0.0, 0.0)), 0), (FAR, 1)):
         auto, fixed = (
-            decide_once(SdcNmpc(Task(), 15, Q=HEAVY, relinearisations=number), plant).command
+            decide_once(SdcNmpc(Task(), horizon=15, Q=HEAVY, relinearisations=number), plant).command
             for number in ("auto", passes)
         )
         np.testing.assert_array_equal(auto, fixed)

@@ -11,6 +11,7 @@ import quad_envs  # noqa: F401  registers the ids
 from baselines import PolicyCheckError, PolicyState, check_policy, make_policy, policy_options
 from baselines.policies.registry import TRACKING_POLICIES
 from baselines.policies.tracking import ControllerPolicy, Hover
+from controllers import LmpcOptions, NmpcOptions, SdcOptions
 from controllers.controller import Decision
 from quad_envs.constraints import actions_from_forces
 
@@ -121,12 +122,11 @@ def test_a_wrapper_that_changes_the_action_box_is_refused():
         make_policy("hover", RescaleAction(gymnasium.make(HELIX), np.float32(0.0), np.float32(1.0)))
 
 
-def test_an_option_that_mpcs_share_has_one_default():
-    linear, *others = (policy_options(name) for name in ("lmpc", "sdc-nmpc", "nmpc"))
-    for other in others:
-        shared = (linear.keys() & other.keys()) - {"velocity_reference"}  # its model alone has level axes
-        assert len(shared) == 14
-        assert [linear[name] for name in shared] == [other[name] for name in shared]
+def test_the_options_of_an_mpc_reach_it_as_the_value_of_their_class():
+    for name, kind in (("lmpc", LmpcOptions), ("sdc-nmpc", SdcOptions), ("nmpc", NmpcOptions)):
+        made = make_policy(name, HELIX, horizon=7, soft_weight=3.0).controller
+        assert made.options == kind(horizon=7, soft_weight=3.0)
+        assert kind(**policy_options(name)) == kind()
 
 
 @pytest.mark.parametrize("kwargs", [{}, RICH], ids=["plain", "rich"])

@@ -30,11 +30,12 @@ SLOW = Task(limits=Limits(kappa=0.3125, rate=5.0))
 
 
 def lmpc(task=TASK, horizon=25):
-    return LinearMPC(task, horizon, frame="hover")
+    return LinearMPC(task, horizon=horizon, frame="hover")
 
 
 def sdc(task=TASK, horizon=25, alpha=1.0, passes=0, weight="hover"):
-    return SdcNmpc(task, horizon, alpha, passes, weight, frame="hover")
+    chosen = {"alpha": alpha, "relinearisations": passes, "terminal_weight": weight}
+    return SdcNmpc(task, horizon=horizon, frame="hover", **chosen)
 
 
 def half(task=TASK, horizon=25):

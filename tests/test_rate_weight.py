@@ -100,12 +100,12 @@ def test_the_condensed_cost_is_the_cost_as_written(model):
 def test_a_decision_is_the_one_of_an_independent_dense_program(mpc, rate):
     """Box and rate limits bind. DAQP stops at 1e-10 of the rows, which its Hessian makes 1e-8 N at most."""
     task = Task(limits=Limits(kappa=0.3125, rate=8.0))
-    controller = mpc(task, N, R_rate=weights(rate, 3.0))
+    controller = mpc(task, horizon=N, R_rate=weights(rate, 3.0))
     plant, rows = at_rest(p=(1.5, -1.0, 0.5), Theta=(0.2, -0.1, 0.3)), window(helix, 0, N)
     arguments = plant, rows, LAST, np.zeros(6), np.zeros(controller.memory_size)
     qp = controller.problem(*arguments)
     if mpc is SdcNmpc:  # whose decision may take a second pass with other matrices
-        controller = mpc(task, N, R_rate=weights(rate, 3.0), relinearisations=0)
+        controller = mpc(task, horizon=N, R_rate=weights(rate, 3.0), relinearisations=0)
     H, g = dense(qp)
     nv, first = len(g), first_move_bounds(qp)
     matrix = np.eye(nv) - np.eye(nv, k=-4)
@@ -117,7 +117,9 @@ def test_a_decision_is_the_one_of_an_independent_dense_program(mpc, rate):
     assert flag == 1
     decision = decide_once(controller, plant, rows, LAST)
     np.testing.assert_allclose(decision.command[0], u[:4] - qp.lower, rtol=0.0, atol=1e-7)
-    assert np.abs(decide_once(mpc(task, N), plant, rows, LAST).command - decision.command).max() > 1e-2
+    assert (
+        np.abs(decide_once(mpc(task, horizon=N), plant, rows, LAST).command - decision.command).max() > 1e-2
+    )
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -137,7 +139,7 @@ def test_both_solvers_decide_alike(mpc):
     """OSQP stops at residuals of 1e-5, which is some 1e-3 N in the first input."""
     plant, rows = at_rest(p=(1.5, -1.0, 0.5)), window(helix, 0, N)
     decisions = [
-        decide_once(mpc(WEAK, N, R_rate=2.0, solver=solver), plant, rows, LAST)
+        decide_once(mpc(WEAK, horizon=N, R_rate=2.0, solver=solver), plant, rows, LAST)
         for solver in ("structured", "osqp")
     ]
     np.testing.assert_allclose(decisions[1].command, decisions[0].command, rtol=0.0, atol=1e-2)
@@ -146,8 +148,8 @@ def test_both_solvers_decide_alike(mpc):
 @pytest.mark.parametrize("mpc", MPCS)
 def test_zeros_are_no_weight_at_all(mpc):
     plant, rows = at_rest(p=(1.5, -1.0, 0.5)), window(helix, 0, N)
-    plain = decide_once(mpc(TASK, N), plant, rows, LAST)
-    zeros = decide_once(mpc(TASK, N, R_rate=np.zeros(4)), plant, rows, LAST)
+    plain = decide_once(mpc(TASK, horizon=N), plant, rows, LAST)
+    zeros = decide_once(mpc(TASK, horizon=N, R_rate=np.zeros(4)), plant, rows, LAST)
     np.testing.assert_array_equal(plain.command, zeros.command)
     np.testing.assert_array_equal(plain.memory, zeros.memory)
 
@@ -155,7 +157,7 @@ def test_zeros_are_no_weight_at_all(mpc):
 @pytest.mark.parametrize("mpc", MPCS)
 def test_a_weight_that_outweighs_everything_keeps_the_command_of_before(mpc):
     """1e6 against a position weight of 1: changes of about 1e-6 times an unweighted one of 1 N."""
-    decision = decide_once(mpc(TASK, N, R_rate=1e6), at_rest(p=(1.0, 0.0, 0.5)), last=LAST)
+    decision = decide_once(mpc(TASK, horizon=N, R_rate=1e6), at_rest(p=(1.0, 0.0, 0.5)), last=LAST)
     np.testing.assert_allclose(decision.command[0], LAST, rtol=0.0, atol=1e-3)
     np.testing.assert_allclose(plan_of(decision, N) + HOVER, np.tile(LAST, (N, 1)), rtol=0.0, atol=1e-2)
 
@@ -171,7 +173,7 @@ def test_a_weight_that_outweighs_everything_keeps_the_command_of_before(mpc):
 @pytest.mark.parametrize("mpc", MPCS)
 def test_a_weight_that_is_none_is_refused_by_name(mpc, value, said):
     with pytest.raises(ValueError, match=said):
-        mpc(TASK, N, R_rate=value)
+        mpc(TASK, horizon=N, R_rate=value)
 
 
 def test_chapter_nine_has_no_certificate_for_it():

@@ -133,7 +133,13 @@ def _list_options(options: ListOptions) -> int:
     from quad_envs.registration import TEAMS, TRACKING
 
     from ..policies.outside import installed_policies
-    from ..policies.registry import TEAM_POLICIES, TRACKING_POLICIES, from_outside, policy_options
+    from ..policies.registry import (
+        TEAM_POLICIES,
+        TRACKING_POLICIES,
+        from_outside,
+        policy_comments,
+        policy_options,
+    )
     from ..training.algorithms import ALGORITHMS, options_of
     from ..training.hyperparameters import hyperparameters, plain_options
 
@@ -153,6 +159,7 @@ def _list_options(options: ListOptions) -> int:
         comments = field_comments(options_of(options.name))
     elif options.name in names or from_outside(options.name):
         values, flag = policy_options(options.name), "--policy-set"
+        comments = policy_comments(options.name)
     else:
         raise ValueError(unknown_name("name", options.name, names))
     if options.json:

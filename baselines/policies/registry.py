@@ -5,11 +5,13 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import fields
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
+from quad_envs.field_comments import field_comments
 from quad_envs.kinds import holds_booleans, is_limit
 from quad_envs.names import shown, unknown_name
 
@@ -19,6 +21,13 @@ from .trained import load_policy, names_trained, shipped_policies
 
 if TYPE_CHECKING:  # not at run time: tasks load numba, and `quad-envs list` has to be quick
     from quad_envs.tasks import BaseTask, Task, TeamTask
+
+
+class _Option(NamedTuple):
+    """What is known of an option before a policy is made."""
+
+    default: Any
+    hint: str  # its annotation
 
 
 class PolicyEntry(NamedTuple):
@@ -177,17 +186,38 @@ def policy_options(name: str) -> dict[str, Any]:
     """
     if from_outside(name):
         return outside_options(name)
-    return {parameter.name: parameter.default for parameter in _parameters(name)}
+    return {option: known.default for option, known in _known_options(name).items()}
 
 
-def _parameters(name: str) -> list[inspect.Parameter]:
-    """Of a policy's factory, behind the task."""
-    return list(inspect.signature(_factory(policy_entry(name))).parameters.values())[1:]
+def policy_comments(name: str) -> dict[str, str]:
+    """What the options of a policy mean, of those that say so beside a field.
+
+    Raises:
+        ValueError: If the name is unknown.
+    """
+    kind = None if from_outside(name) else _options_type(_factory(policy_entry(name)))
+    return {} if kind is None else field_comments(kind)
 
 
-def _check_kind(name: str, parameter: inspect.Parameter, value: Any) -> None:
+def _options_type(factory: Callable[..., Any]) -> type[Any] | None:
+    """The dataclass of the options that a factory takes behind the task; None: it takes keywords."""
+    kind: type[Any] | None = getattr(factory, "options_type", None)
+    return kind
+
+
+def _known_options(name: str) -> dict[str, _Option]:
+    """Of a policy: the fields of its options, or the parameters of its factory behind the task."""
+    factory = _factory(policy_entry(name))
+    kind = _options_type(factory)
+    if kind is not None:
+        return {field.name: _Option(field.default, str(field.type)) for field in fields(kind)}
+    parameters = list(inspect.signature(factory).parameters.values())[1:]
+    return {one.name: _Option(one.default, str(one.annotation)) for one in parameters}
+
+
+def _check_kind(name: str, option: str, known: _Option, value: Any) -> None:
     """Refuse a word for a number and the like; whether the number is allowed, the controller knows."""
-    option, default, hint = parameter.name, parameter.default, str(parameter.annotation)
+    default, hint = known
     if "ArrayLike" in hint:
         kind, fits = "numbers", not isinstance(value, str) and not holds_booleans(value)
     elif isinstance(default, bool):
@@ -233,12 +263,12 @@ def make_policy(name: str | os.PathLike[str] | Any, env: Any, **options: Any) ->
             raise ValueError(f"a trained policy has no options, got {', '.join(options)}")
         return load_policy(name, env)
     name = str(name)
-    known = {parameter.name: parameter for parameter in _parameters(name)}
+    known = _known_options(name)
     for option, value in options.items():
         if option not in known:
             raise ValueError(unknown_name(f"option of policy {name!r}:", option, known))
-        _check_kind(name, known[option], value)
-    defaults = policy_options(name)
+        _check_kind(name, option, known[option], value)
+    defaults = {option: each.default for option, each in known.items()}
     task: BaseTask = task_of(env)
     factory = _factory(policy_entry(name, task.mission))
     if task.mission in TEAM_MISSIONS:
@@ -247,8 +277,9 @@ def make_policy(name: str | os.PathLike[str] | Any, env: Any, **options: Any) ->
 
 
 def _built(name: str, factory: Callable[..., Any], task: BaseTask, options: Mapping[str, Any]) -> Any:
+    kind = _options_type(factory)
     try:
-        return factory(task, **options)
+        return factory(task, **options) if kind is None else factory(task, kind(**options))
     except TypeError as error:
         raise ValueError(f"policy {name!r} refused its options {dict(options)}: {error}") from error
 

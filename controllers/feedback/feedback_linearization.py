@@ -29,7 +29,7 @@ from quad_envs.turning import turn_rate
 from ..controller import TURNING_ROWS, FeedbackLaw, first_non_finite
 from ..fallback import HOVER, NONE, limit_command, yield_yaw
 from ..mpc.kernels import governed
-from ..mpc.mpc import Frame, require_choice
+from ..mpc.options import Frame, require_choice
 from ..qp.ocp import IntArray
 
 KP, KD, KA, KAD = range(4)  # entries of the gains

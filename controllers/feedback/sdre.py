@@ -18,7 +18,7 @@ from ..disturbance import feed_forward
 from ..fallback import CLIPPED_SDRE, HOVER, NONE, limit_command, yield_yaw
 from ..model import hover_pair, sdc_matrix, sdc_pair, zero_order_hold
 from ..mpc.kernels import add_rotor_lag, copy_vector, rotor_lag, set_references, set_state
-from ..mpc.mpc import Frame, VelocityReference, require_choice
+from ..mpc.options import Frame, VelocityReference, require_choice
 from ..qp.linalg import copy
 from ..qp.ocp import IntArray, OcpQp, no_rows
 from ..qp.riccati import DARE_SCRATCH, dare, lqr_gain, solve_dare, stage_gains
@@ -120,7 +120,7 @@ class Sdre(FeedbackLaw):
         task: What is known of the flight.
         alpha: Member of the family of factorisations, in [0, 1]; see `model.sdc_matrix`.
         frame: "heading" or "hover", see `LinearMPC`.
-        velocity_reference: "heading" or "attitude", see `SdcNmpc`.
+        velocity_reference: "heading" or "attitude", see `SdcOptions`.
 
     Raises:
         ValueError: If an option is not allowed.
@@ -209,7 +209,7 @@ class Lqr(Sdre):
     Args:
         task: What is known of the flight.
         frame: "heading" or "hover", see `LinearMPC`.
-        velocity_reference: "heading" or "attitude", see `SdcNmpc`; "attitude" costs up to 3 times less.
+        velocity_reference: "heading" or "attitude", see `SdcOptions`; "attitude" costs up to 3 times less.
 
     Raises:
         ValueError: If an option is not allowed.

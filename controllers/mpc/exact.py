@@ -7,22 +7,19 @@ out the second derivatives of e.
 
 from __future__ import annotations
 
-from typing import Any, Literal
-
-from numpy.typing import ArrayLike
+from typing import Any
 
 from quad_envs._numba import kernel
-from quad_envs.checks import require_whole
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 from quad_envs.rotations import sincos, wrap_angle_scalar
 from quad_envs.tasks import Task
 
-from ..controller import MOST_PASSES, first_non_finite
+from ..controller import first_non_finite
 from ..fallback import RELAXED
 from ..model import RK4_SCRATCH, rk4_sensitivities, rotated_derivatives
 from ..qp.linalg import copy, fill
 from ..qp.ocp import IntArray
-from ..qp.structured import ITERATION_LIMIT, Workspace
+from ..qp.structured import Workspace
 from .kernels import (
     MpcData,
     Scratch,
@@ -33,20 +30,9 @@ from .kernels import (
     left_model,
     solve_within_model,
 )
-from .mpc import (
-    EXACT_TILT,
-    SOFT_WEIGHT,
-    Frame,
-    Mpc,
-    MpcOptions,
-    Problem,
-    SolverName,
-    default_rate,
-    default_tilt,
-    require_choice,
-)
+from .mpc import Mpc, Problem
+from .options import EXACT_TILT, NmpcOptions, chosen
 
-VelocityError = Literal["inertial", "body"]
 CONVERGED = 1e-6  # N, largest change of an input in the last pass
 _PITCH_LIMIT = 1.4  # rad, of the states at which the model is linearised
 _RK4 = RK4_SCRATCH * (N_STATE + N_INPUT)
@@ -279,70 +265,27 @@ class ExactNmpc(Mpc):
 
     Args:
         task: What is known of the flight.
-        horizon: N, samples.
-        passes: 1: real-time iteration, one QP per sample about the shifted solution; more: SQP until no input
-            changes by 1e-6 N, 30 is ample.
-        velocity_error: "inertial": V_B - R_BI(Theta) v_ref with the predicted attitude, as the reward has it;
-            "body": V_B - v_ref, v_ref turned by the present heading (frame "heading") or not (frame "hover").
-        solver: See `LinearMPC`, as the options that follow.
-        frame: "heading" or "hover".
-        soft_weight: Exact penalty per unit of a state row; inf makes the rows hard.
-        margin: What the plan keeps from each state limit, in its SI unit: cover for the unmodelled rotor lag.
-        reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
-        estimator_gain: Share of each new residual in the estimate, in (0, 1]; "auto" takes it from
-            `task.sensor_noise`, 0.5 without any.
-        iteration_limit: Largest number of active-set steps of a solve; 0 for one that grows with it.
-        Q: Weight of the state, a number, the diagonal (12,) or a matrix; the reward's by default.
-        R: Weight of the rotor forces, a number, the diagonal (4,) or a matrix; the reward's by default.
-        plan_tilt: Largest roll and pitch of a plan, rad, besides the task's limit: where the model holds.
-            None stands for 1.0 in frame "heading" and no such limit in frame "hover".
-        plan_rate: Largest roll and pitch rate of a plan, rad/s, half of it in yaw, likewise; by default
-            0.3 rad a sample.
-        terminal: Factor of P, the weight of x_N, or a matrix (12, 12) in its place.
-        R_rate: Weight of the changes of the forces from sample to sample, the first one against the command
-            applied before; a number, the diagonal (4,) or a matrix. None: changes cost nothing.
+        options: See `NmpcOptions`; None for the defaults.
+        changes: Fields of it, such as horizon=10, which replace those of `options`.
 
     Raises:
+        TypeError: If there is no such option.
         ValueError: If an option is not allowed.
     """
 
-    def __init__(
-        self,
-        task: Task,
-        horizon: int = 25,
-        passes: int = 1,
-        velocity_error: VelocityError = "inertial",
-        *,
-        solver: SolverName = "structured",
-        frame: Frame = "heading",
-        soft_weight: float = SOFT_WEIGHT,
-        margin: float = 0.02,
-        reject_disturbance: bool = False,
-        estimator_gain: float | Literal["auto"] = "auto",
-        iteration_limit: int = ITERATION_LIMIT,
-        Q: ArrayLike | None = None,
-        R: ArrayLike | None = None,
-        plan_tilt: float | None = None,
-        plan_rate: float | None = None,
-        terminal: ArrayLike = 1.0,
-        R_rate: ArrayLike | None = None,
-    ) -> None:
-        require_whole("passes", passes, 1, MOST_PASSES)
-        require_choice("velocity_error", velocity_error, VelocityError)
-        options = MpcOptions(
-            solver, frame, "heading", soft_weight, margin, reject_disturbance, estimator_gain,
-            iteration_limit, Q, R, default_tilt(plan_tilt, EXACT_TILT, frame),
-            default_rate(plan_rate, task.dt, frame), terminal, R_rate,
-        )  # fmt: skip
-        super().__init__(task, horizon, options, pairs=horizon, guess=True)
+    options_type = NmpcOptions
+    options: NmpcOptions
+
+    def __init__(self, task: Task, options: NmpcOptions | None = None, **changes: Any) -> None:
+        options = chosen(NmpcOptions, options, changes)
+        super().__init__(task, options, "heading", many_pairs=True, guess=True)
         self._data = self._data._replace(model_tilt=EXACT_TILT)
-        self.passes = int(passes)
-        self.velocity_error = velocity_error
+        self.passes = int(options.passes)
+        self._inertial = options.velocity_error == "inertial"
 
     def _decide_rows(self, *arrays: Any) -> int:
         which, buffer, ws = self._scratch()
-        inertial = self.velocity_error == "inertial"
-        constants = (which, self.passes, inertial, self._keep_from, self._data, buffer, ws)
+        constants = (which, self.passes, self._inertial, self._keep_from, self._data, buffer, ws)
         arguments: tuple[Any, ...] = (*arrays, *constants)
         return _decide_rows(*arguments)
 
@@ -350,7 +293,7 @@ class ExactNmpc(Mpc):
         if number == 0:
             load_guess(memory, memory[self._keep_from :], self._data.heading, s)
         linearise_model(self._data, s)
-        linearise_cost(self.velocity_error == "inertial", self._data, s)
+        linearise_cost(self._inertial, self._data, s)
         return Problem(s.A, s.B, s.Q, s.P, False, s.target)
 
     def _accept(self, number: int, s: Scratch, ws: Workspace) -> bool:

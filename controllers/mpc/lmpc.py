@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from quad_envs._numba import kernel
 from quad_envs.parameters import ATTITUDE, Array
@@ -14,7 +13,7 @@ from quad_envs.tasks import Task
 from ..controller import first_non_finite
 from ..model import hover_pair
 from ..qp.ocp import IntArray
-from ..qp.structured import ITERATION_LIMIT, Workspace
+from ..qp.structured import Workspace
 from .kernels import (
     MpcData,
     Scratch,
@@ -25,20 +24,8 @@ from .kernels import (
     left_model,
     solve_within_model,
 )
-from .mpc import (
-    PLAN_TILT,
-    SOFT_WEIGHT,
-    Frame,
-    Mpc,
-    MpcOptions,
-    Problem,
-    SolverName,
-    default_rate,
-    default_tilt,
-    require_choice,
-)
-
-LevelReference = Literal["level", "heading", "attitude"]
+from .mpc import Mpc, Problem
+from .options import LmpcOptions, chosen
 
 
 @kernel
@@ -87,71 +74,20 @@ class LinearMPC(Mpc):
 
     Args:
         task: What is known of the flight.
-        horizon: N, samples.
-        solver: "structured" (exact, one compiled call) or "osqp".
-        frame: "heading" or "hover".
-        velocity_reference: What is compared with v_ref in frame "heading". "level": the velocity, turned by
-            the present attitude into the level axes of v_ref, which is the rate of the position, too.
-            "attitude": V_B, with v_ref turned into its axes; "heading": V_B, with v_ref as it is. Both move
-            positions by V_B: the longer the horizon, the more that costs.
-        soft_weight: Exact penalty per unit of a state row; inf makes the rows hard.
-        margin: What the plan keeps from each state limit, in its SI unit: cover for the unmodelled rotor lag.
-        reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
-        estimator_gain: Share of each new residual in the estimate, in (0, 1]; "auto" takes it from
-            `task.sensor_noise`, 0.5 without any.
-        iteration_limit: Largest number of active-set steps of a solve; 0 for one that grows with it.
-        Q: Weight of the state, a number, the diagonal (12,) or a matrix; the reward's by default.
-        R: Weight of the rotor forces, a number, the diagonal (4,) or a matrix; the reward's by default.
-        plan_tilt: Largest roll and pitch of a plan, rad, besides the task's limit: where the model holds.
-            None stands for 0.8 in frame "heading" and no such limit in frame "hover".
-        plan_rate: Largest roll and pitch rate of a plan, rad/s, half of it in yaw, likewise; by default
-            0.3 rad a sample.
-        terminal: Factor of P, the weight of x_N, or a matrix (12, 12) in its place.
-        R_rate: Weight of the changes of the forces from sample to sample, the first one against the command
-            applied before; a number, the diagonal (4,) or a matrix. None: changes cost nothing.
+        options: See `LmpcOptions`; None for the defaults.
+        changes: Fields of it, such as horizon=10, which replace those of `options`.
 
     Raises:
+        TypeError: If there is no such option.
         ValueError: If an option is not allowed.
     """
 
-    def __init__(
-        self,
-        task: Task,
-        horizon: int = 25,
-        *,
-        solver: SolverName = "structured",
-        frame: Frame = "heading",
-        velocity_reference: LevelReference = "level",
-        soft_weight: float = SOFT_WEIGHT,
-        margin: float = 0.02,
-        reject_disturbance: bool = False,
-        estimator_gain: float | Literal["auto"] = "auto",
-        iteration_limit: int = ITERATION_LIMIT,
-        Q: ArrayLike | None = None,
-        R: ArrayLike | None = None,
-        plan_tilt: float | None = None,
-        plan_rate: float | None = None,
-        terminal: ArrayLike = 1.0,
-        R_rate: ArrayLike | None = None,
-    ) -> None:
-        require_choice("velocity_reference", velocity_reference, LevelReference)
-        options = MpcOptions(
-            solver,
-            frame,
-            velocity_reference,
-            soft_weight,
-            margin,
-            reject_disturbance,
-            estimator_gain,
-            iteration_limit,
-            Q,
-            R,
-            default_tilt(plan_tilt, PLAN_TILT, frame),
-            default_rate(plan_rate, task.dt, frame),
-            terminal,
-            R_rate,
-        )
-        super().__init__(task, horizon, options, pairs=1, guess=False)
+    options_type = LmpcOptions
+    options: LmpcOptions
+
+    def __init__(self, task: Task, options: LmpcOptions | None = None, **changes: Any) -> None:
+        options = chosen(LmpcOptions, options, changes)
+        super().__init__(task, options, options.velocity_reference, many_pairs=False, guess=False)
         self._data = self._data._replace(first_angle=ATTITUDE.start + 2)
         A, B = hover_pair(task.params, task.dt)
         self._A, self._B = np.ascontiguousarray(A[None]), np.ascontiguousarray(B[None])

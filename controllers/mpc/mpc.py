@@ -1,28 +1,24 @@
-"""What all MPCs share in Python: options and their checks, memory, and the batched decision."""
+"""What all MPCs share in Python: constants, memory, and the batched decision."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quad_envs.checks import require_whole
-from quad_envs.names import shown
 from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, RATES, VELOCITY, Array, Limits
 from quad_envs.tasks import BaseTask, Task
 
-from ..controller import Decision, as_one_row, as_rows, first_non_finite, raise_non_finite, require_horizon
+from ..controller import Decision, as_one_row, as_rows, first_non_finite, raise_non_finite
 from ..disturbance import ESTIMATOR_SIZE, N_DISTURBANCE
 from ..fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXED_WEIGHT
 from ..model import hover_pair
 from ..qp import Backend, Status, StructuredSolver
 from ..qp.ocp import IntArray, OcpQp, StateRows, concatenate_rows, no_rows, output_rows
 from ..qp.riccati import dare
-from ..qp.solution import MOST_ITERATIONS
 from ..qp.structured import Workspace, make_workspace
 from .estimator_gain import estimator_gains
 from .kernels import (
@@ -37,78 +33,11 @@ from .kernels import (
     left_model,
     rotor_lag,
 )
+from .options import PLAN_TILT, MpcOptions, VelocityAxes
 from .weights import change_weight, require_turnable, terminal_weight, weight_matrix
 
-SolverName = Literal["structured", "osqp"]
-Frame = Literal["heading", "hover"]
-VelocityReference = Literal["heading", "attitude"]
-VelocityAxes = Literal["level", "present", "heading", "attitude"]
 PLAN_WEIGHT = 1e4  # per rad, rad/s: of rows that keep a plan in its model; 1e3 gives way to heavy positions
-PLAN_TILT = 0.8  # rad, of models linear in the attitude
-PLAN_TURN = 0.3  # rad, of roll and pitch from sample to sample
 YAW_SHARE = 0.5  # of it for yaw: the axes of the problem stay where the heading is now
-EXACT_TILT = 1.0  # rad, of the exact model
-SOFT_WEIGHT = 25.0  # per SI unit: keeps the corridor's limits; from 30 on, 3 m outside walls, some flip
-
-
-def require_choice(name: str, value: object, kind: Any) -> None:
-    """Check that `value` is one of the strings of a Literal type.
-
-    Raises:
-        ValueError: If it is not; names what is allowed.
-    """
-    if value not in get_args(kind):
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, get_args(kind)))}, got {shown(value)}")
-
-
-@dataclass(frozen=True, slots=True)
-class MpcOptions:
-    """Options that every MPC takes; `LinearMPC` explains them.
-
-    Raises:
-        ValueError: If one is not allowed.
-    """
-
-    solver: SolverName
-    frame: Frame
-    velocity_reference: VelocityAxes
-    soft_weight: float
-    margin: float
-    reject_disturbance: bool
-    estimator_gain: float | Literal["auto"]
-    iteration_limit: int
-    Q: ArrayLike | None = None  # weight of the state: number, diagonal (12,) or matrix; None: the reward's
-    R: ArrayLike | None = None  # weight of the forces: number, diagonal (4,) or matrix; None: the reward's
-    plan_tilt: float = math.inf  # rad, largest roll and pitch of a plan, for the sake of its model
-    plan_rate: float = math.inf  # rad/s, largest roll and pitch rate of a plan, half of it in yaw, likewise
-    terminal: ArrayLike = 1.0  # factor of P, the weight of x_N, or a matrix (12, 12) in the problem's axes
-    R_rate: ArrayLike | None = None  # weight of the changes of the forces, as R; None: none
-
-    def __post_init__(self) -> None:
-        require_choice("solver", self.solver, SolverName)
-        require_choice("frame", self.frame, Frame)
-        if not self.soft_weight >= 0.0:
-            raise ValueError(
-                f"soft_weight must be >= 0 (math.inf for hard rows), got {shown(self.soft_weight)}"
-            )
-        if not 0.0 <= self.margin < math.inf:
-            raise ValueError(
-                f"margin must be a finite number >= 0, in SI units of each limit, got {shown(self.margin)}"
-            )
-        if self.estimator_gain != "auto" and not 0.0 < self.estimator_gain <= 1.0:
-            raise ValueError(
-                f"estimator_gain must be 'auto' or lie in (0, 1], got {shown(self.estimator_gain)}"
-            )
-        if not self.plan_tilt > 0.0:
-            raise ValueError(f"plan_tilt must be > 0 rad, got {shown(self.plan_tilt)}; math.inf is no limit")
-            raise ValueError(f"plan_tilt must be > 0 rad, got {self.plan_tilt!r}; math.inf is no limit")
-        if not self.plan_rate > 0.0:
-            raise ValueError(
-                f"plan_rate must be > 0 rad/s, got {shown(self.plan_rate)}; math.inf is no limit"
-            )
-        require_whole(
-            "iteration_limit (0: one that grows with the problem)", self.iteration_limit, 0, MOST_ITERATIONS
-        )
 
 
 class Problem(NamedTuple):
@@ -142,26 +71,12 @@ def limit_rows(limits: Limits, margin: float, weight: float, horizon: int) -> tu
     return rows, np.where(outputs < POSITION.stop, outputs, -1).astype(np.int64)
 
 
-def default_tilt(plan_tilt: float | None, usual: float, frame: Frame) -> float:
-    """The tilt that a plan keeps to, rad: as chosen, else the usual one, in the dissertation's frame none."""
-    if plan_tilt is not None:
-        return plan_tilt
-    return usual if frame == "heading" else math.inf
-
-
-def default_rate(plan_rate: float | None, dt: float, frame: Frame) -> float:
-    """The rate that a plan keeps to, rad/s: as chosen, else `PLAN_TURN` a sample; cf. `default_tilt`."""
-    if plan_rate is not None:
-        return plan_rate
-    return PLAN_TURN / dt if frame == "heading" else math.inf
-
-
-def plan_bound(options: MpcOptions, limits: Limits) -> Array:
+def plan_bound(options: MpcOptions, task: BaseTask) -> Array:
     """Largest magnitude of each state of a plan where its model holds, (12,); inf for none of its own."""
     bound = np.full(N_STATE, math.inf)
-    if options.plan_tilt < limits.tilt:
-        bound[ATTITUDE][:2] = options.plan_tilt
-    bound[RATES] = options.plan_rate * np.array([1.0, 1.0, YAW_SHARE])
+    if options.largest_tilt() < task.limits.tilt:
+        bound[ATTITUDE][:2] = options.largest_tilt()
+    bound[RATES] = options.largest_rate(task.dt) * np.array([1.0, 1.0, YAW_SHARE])
     return bound
 
 
@@ -185,16 +100,17 @@ def estimator_gain(task: BaseTask, options: MpcOptions) -> Array:
     return np.full(N_DISTURBANCE, float(options.estimator_gain))
 
 
-def mpc_data(task: BaseTask, horizon: int, options: MpcOptions) -> MpcData:
-    """The constants of a controller."""
-    params = task.params
+def mpc_data(task: BaseTask, options: MpcOptions, axes: VelocityAxes) -> MpcData:
+    """The constants of a controller that compares velocities with v_ref in these axes, in frame "heading"."""
+    params, horizon = task.params, int(options.horizon)
+    heading = options.frame == "heading"
     Q = weight_matrix("Q", task.weights.Q if options.Q is None else options.Q, N_STATE, definite=False)
     R = weight_matrix("R", task.weights.R if options.R is None else options.R, N_INPUT, definite=True)
     P = terminal_weight(options.terminal, dare(*hover_pair(params, task.dt), Q, R))
-    if options.frame == "heading":
+    if heading:
         require_turnable(Q)
     own, axis = limit_rows(task.limits, options.margin, options.soft_weight, horizon)
-    bound = plan_bound(options, task.limits)
+    bound = plan_bound(options, task)
     planned = plan_rows(bound, horizon)
     rows = concatenate_rows(own, planned)
     return MpcData(
@@ -216,10 +132,10 @@ def mpc_data(task: BaseTask, horizon: int, options: MpcOptions) -> MpcData:
         rate_step=float(task.limits.rate * task.dt),
         lag=rotor_lag(task),
         gain=estimator_gain(task, options),
-        heading=options.frame == "heading",
-        attitude=options.frame == "heading" and options.velocity_reference in ("attitude", "present"),
-        level=options.frame == "heading" and options.velocity_reference == "level",
-        present=options.frame == "heading" and options.velocity_reference == "present",
+        heading=heading,
+        attitude=heading and axes in ("attitude", "present"),
+        level=heading and axes == "level",
+        present=heading and axes == "present",
         kinematics=False,
         iteration_limit=int(options.iteration_limit),
         plan_bound=bound,
@@ -236,13 +152,16 @@ class Mpc(ABC):
     Not for use by several threads at once: the scratch memory is shared.
     """
 
-    def __init__(self, task: Task, horizon: int, options: MpcOptions, *, pairs: int, guess: bool) -> None:
-        horizon = require_horizon(horizon)
+    options: MpcOptions
+
+    def __init__(
+        self, task: Task, options: MpcOptions, axes: VelocityAxes, *, many_pairs: bool, guess: bool
+    ) -> None:
         self.task = task
-        self.horizon = horizon
+        self.horizon = int(options.horizon)
         self.options = options
-        self._data = mpc_data(task, self.horizon, options)
-        self._pairs = pairs
+        self._data = mpc_data(task, options, axes)
+        self._pairs = self.horizon if many_pairs else 1
         self._guess_stages = self.horizon if guess else 0
         self._keep_from = (
             1 + MEMORY_STAGE * self.horizon + (ESTIMATOR_SIZE if options.reject_disturbance else 0)

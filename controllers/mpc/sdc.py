@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
-
-import numpy as np
-from numpy.typing import ArrayLike
+from typing import Any
 
 from quad_envs._numba import kernel
-from quad_envs.checks import require_whole
-from quad_envs.names import shown
 from quad_envs.parameters import N_STATE, Array
 from quad_envs.tasks import Task
 
-from ..controller import MOST_PASSES, first_non_finite
+from ..controller import first_non_finite
 from ..fallback import RELAXED
 from ..model import sdc_matrix, zero_order_hold
 from ..qp.linalg import copy
 from ..qp.ocp import IntArray
 from ..qp.riccati import solve_dare
-from ..qp.structured import ITERATION_LIMIT, Workspace
+from ..qp.structured import Workspace
 from .kernels import (
     FROZEN_SPAN,
     MpcData,
@@ -32,22 +27,10 @@ from .kernels import (
     left_model,
     solve_within_model,
 )
-from .mpc import (
-    PLAN_TILT,
-    SOFT_WEIGHT,
-    Frame,
-    Mpc,
-    MpcOptions,
-    Problem,
-    SolverName,
-    default_rate,
-    default_tilt,
-    require_choice,
-)
+from .mpc import Mpc, Problem
+from .options import SdcOptions, chosen
 from .present_axes import pair_in_present_axes, stop_turning
 
-TerminalWeight = Literal["hover", "sdre"]
-PresentReference = Literal["present", "heading", "attitude"]
 _TILT_LIMIT = 1.4  # rad, of roll and pitch of the states at which the model is taken again
 
 
@@ -202,116 +185,36 @@ class SdcNmpc(Mpc):
 
     Args:
         task: What is known of the flight.
-        horizon: N, samples.
-        alpha: Member of the family of factorisations, in [0, 1]; see `model.sdc_matrix`.
-        relinearisations: Further passes, each with the pairs along the plan of the pass before. "auto" makes
-            one where the plan turns by more than FROZEN_SPAN, none in frame "hover"; 0 is the dissertation's.
-        terminal_weight: "hover": P of the hover model; "sdre": P of the present pair.
-        solver: See `LinearMPC`, as the options that follow.
-        frame: "heading" or "hover".
-        velocity_reference: What is compared with v_ref, in frame "heading". "present": the velocity in axes
-            of the present attitude (`present_axes.py`), into which v_ref is turned. "heading", "attitude":
-            V_B, which turns along the plan, with v_ref turned by the present heading, or by the whole present
-            attitude. None: "present", or with another alpha than 1 "heading".
-        soft_weight: Exact penalty per unit of a state row; inf makes the rows hard.
-        margin: What the plan keeps from each state limit, in its SI unit: cover for the unmodelled rotor lag.
-        reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
-        estimator_gain: Share of each new residual in the estimate, in (0, 1]; "auto" takes it from
-            `task.sensor_noise`, 0.5 without any.
-        iteration_limit: Largest number of active-set steps of a solve; 0 for one that grows with it.
-        Q: Weight of the state, a number, the diagonal (12,) or a matrix; the reward's by default.
-        R: Weight of the rotor forces, a number, the diagonal (4,) or a matrix; the reward's by default.
-        plan_tilt: Largest roll and pitch of a plan, rad, besides the task's limit: where the model holds.
-            None stands for 0.8 in frame "heading" and no such limit in frame "hover".
-        plan_rate: Largest roll and pitch rate of a plan, rad/s, half of it in yaw, likewise; by default
-            0.3 rad a sample.
-        terminal: Factor of P, the weight of x_N, or a matrix (12, 12) in its place.
-        R_rate: Weight of the changes of the forces from sample to sample, the first one against the command
-            applied before; a number, the diagonal (4,) or a matrix. None: changes cost nothing.
+        options: See `SdcOptions`; None for the defaults.
+        changes: Fields of it, such as horizon=10, which replace those of `options`.
 
     Raises:
+        TypeError: If there is no such option.
         ValueError: If an option is not allowed.
     """
 
-    def __init__(
-        self,
-        task: Task,
-        horizon: int = 25,
-        alpha: float = 1.0,
-        relinearisations: int | Literal["auto"] = "auto",
-        terminal_weight: TerminalWeight = "hover",
-        *,
-        solver: SolverName = "structured",
-        frame: Frame = "heading",
-        velocity_reference: PresentReference | None = None,
-        soft_weight: float = SOFT_WEIGHT,
-        margin: float = 0.02,
-        reject_disturbance: bool = False,
-        estimator_gain: float | Literal["auto"] = "auto",
-        iteration_limit: int = ITERATION_LIMIT,
-        Q: ArrayLike | None = None,
-        R: ArrayLike | None = None,
-        plan_tilt: float | None = None,
-        plan_rate: float | None = None,
-        terminal: ArrayLike = 1.0,
-        R_rate: ArrayLike | None = None,
-    ) -> None:
-        if not 0.0 <= alpha <= 1.0:
-            raise ValueError(
-                f"alpha must lie in [0, 1], got {shown(alpha)}; 1/2 is the dissertation's, 1 recommended"
-            )
-        if isinstance(relinearisations, str) and relinearisations == "auto":
-            passes = 1 if frame == "heading" else 0
-        else:
-            require_whole("relinearisations, if not 'auto',", relinearisations, 0, MOST_PASSES)
-            passes = int(relinearisations)
-        if velocity_reference is None:
-            velocity_reference = "present" if frame == "heading" and alpha == 1.0 else "heading"
-        require_choice("velocity_reference", velocity_reference, PresentReference)
-        if velocity_reference == "present" and alpha != 1.0:
-            raise ValueError(
-                f"velocity_reference='present' leaves out -Omega x V_B, which alpha = {alpha!r} splits: "
-                "take alpha=1, or 'heading' or 'attitude'"
-            )
-        require_choice("terminal_weight", terminal_weight, TerminalWeight)
-        options = MpcOptions(
-            solver,
-            frame,
-            velocity_reference,
-            soft_weight,
-            margin,
-            reject_disturbance,
-            estimator_gain,
-            iteration_limit,
-            Q,
-            R,
-            default_tilt(plan_tilt, PLAN_TILT, frame),
-            default_rate(plan_rate, task.dt, frame),
-            terminal,
-            R_rate,
-        )
-        if terminal_weight == "sdre" and (np.ndim(terminal) > 0 or terminal != 1.0):
-            raise ValueError(
-                "terminal changes P of the hover model; terminal_weight='sdre' has another P at each sample: "
-                "leave terminal out, or choose terminal_weight='hover'"
-            )
-        super().__init__(task, horizon, options, pairs=horizon if passes else 1, guess=False)
+    options_type = SdcOptions
+    options: SdcOptions
+
+    def __init__(self, task: Task, options: SdcOptions | None = None, **changes: Any) -> None:
+        options = chosen(SdcOptions, options, changes)
+        self.relinearisations = options.further_passes()
+        super().__init__(task, options, options.axes(), many_pairs=self.relinearisations > 0, guess=False)
         self._data = self._data._replace(kinematics=True)
-        self.alpha = float(alpha)
+        self.alpha = float(options.alpha)
         self._present = self._data.present
-        self.relinearisations, self._at_need = passes, relinearisations == "auto"
-        self.terminal_weight = terminal_weight
+        self._at_need = options.at_need
+        self._sdre_weight = options.terminal_weight == "sdre"
 
     def _decide_rows(self, *arrays: Any) -> int:
         which, buffer, ws = self._scratch()
-        sdre_weight = self.terminal_weight == "sdre"
         constants = (
             which,
             self.alpha,
             self._present,
             self.relinearisations,
             self._at_need,
-            sdre_weight,
+            self._sdre_weight,
             self._data,
             buffer,
             ws,
@@ -322,9 +225,7 @@ class SdcNmpc(Mpc):
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
         stationary, pairs = False, 1
         if number == 0:
-            stationary = freeze_model(
-                self.alpha, self._present, self.terminal_weight == "sdre", self._data, s
-            )
+            stationary = freeze_model(self.alpha, self._present, self._sdre_weight, self._data, s)
         else:
             relinearise(ws.u, self.alpha, self._present, self._data, s)
             pairs = self.horizon

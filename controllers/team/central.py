@@ -35,10 +35,10 @@ from ..controller import PLANT_SIZE, Decision, as_array, require_horizon
 from ..fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, limit_command
 from ..model import sdc_pair
 from ..mpc.kernels import add_rotor_lag, left_model
-from ..mpc.mpc import MpcOptions, mpc_data
+from ..mpc.mpc import mpc_data
+from ..mpc.options import MpcOptions
 from ..qp.ocp import Condensed, OcpQp, condense, no_rows
 from ..qp.solution import MOST_ITERATIONS
-from ..qp.structured import ITERATION_LIMIT
 
 _SOLVED = 1
 _NO_BOUND = 1e30  # OSQP's infinity
@@ -134,9 +134,9 @@ class CentralMpc:
         self.task, self.horizon, self.alpha = task, horizon, float(alpha)
         self.braking_time, self.swirl = float(braking_time), float(swirl)
         options = MpcOptions(
-            "osqp", "heading", "attitude", soft_weight, margin, False, "auto", ITERATION_LIMIT
+            horizon=horizon, soft_weight=soft_weight, margin=margin, plan_tilt=math.inf, plan_rate=math.inf
         )
-        self._data = mpc_data(task, self.horizon, options)
+        self._data = mpc_data(task, options, "attitude")
         self._validity = self._data.model_tilt, self._data.first_angle
         self._pairs = np.stack(np.triu_indices(task.vehicles, 1), axis=-1)
         n, N, K = task.vehicles, self.horizon, len(self._data.normal)

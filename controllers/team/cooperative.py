@@ -26,7 +26,8 @@ from quad_envs.tasks import TeamTask
 from ..controller import PLANT_SIZE, as_array, require_horizon
 from ..disturbance import ESTIMATOR_SIZE, N_DISTURBANCE
 from ..mpc.kernels import MEMORY_STAGE, buffer_size, carve
-from ..mpc.mpc import MpcOptions, mpc_data, require_choice
+from ..mpc.mpc import mpc_data
+from ..mpc.options import MpcOptions, require_choice
 from ..qp.ocp import IntArray, OcpQp, StateRows, concatenate_rows
 from ..qp.structured import ITERATION_LIMIT, make_workspace
 from .collision import COLLISION_SCRATCH, AvoidanceOptions, AvoidanceRule, AvoidanceSet, time_to_stop
@@ -142,9 +143,15 @@ class CooperativeMpc:
             avoidance, avoidance_set, moving_centre, braking_time, swirl, separation_weight, separation_margin
         )
         self.options = MpcOptions(
-            "structured", "heading", "attitude", soft_weight, margin, reject_disturbance, estimator_gain,
-            iteration_limit,
-        )  # fmt: skip
+            horizon=horizon,
+            soft_weight=soft_weight,
+            margin=margin,
+            reject_disturbance=reject_disturbance,
+            estimator_gain=estimator_gain,
+            iteration_limit=iteration_limit,
+            plan_tilt=math.inf,  # `_prepare` makes it a limit of the task
+            plan_rate=math.inf,
+        )
         require_messages(task.layout.comm_size, self.consensus)
         self.avoidance.require_plans(task.layout.plan)
         self._prepare(float(alpha), terminal_weight == "stage", float(plan_tilt), bool(turning))
@@ -157,7 +164,7 @@ class CooperativeMpc:
         task, edges = self.task, self.avoidance.neighbours == "edges"
         tilt = min(task.limits.tilt, plan_tilt + self.options.margin)
         planned = replace(task, limits=replace(task.limits, tilt=tilt))
-        data = mpc_data(planned, self.horizon, self.options)
+        data = mpc_data(planned, self.options, "attitude")
         slots = task.layout.neighbours if edges else task.layout.sensed
         limits = StateRows(data.normals, data.normal, data.stage, data.lower, data.upper, data.weight)
         separation = self.avoidance.layout(slots, self.horizon)

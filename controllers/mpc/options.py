@@ -1,0 +1,231 @@
+"""What the MPCs let choose, as frozen values; the comment of a field is its documentation everywhere."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar, Literal, TypeVar, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quad_envs.checks import require_whole
+from quad_envs.names import shown, unknown_name
+
+from ..controller import MOST_PASSES, require_horizon
+from ..qp.solution import MOST_ITERATIONS
+from ..qp.structured import ITERATION_LIMIT
+
+SolverName = Literal["structured", "osqp"]
+Frame = Literal["heading", "hover"]
+VelocityReference = Literal["heading", "attitude"]
+LevelReference = Literal["level", "heading", "attitude"]
+PresentReference = Literal["present", "heading", "attitude"]
+VelocityAxes = Literal["level", "present", "heading", "attitude"]
+VelocityError = Literal["inertial", "body"]
+TerminalWeight = Literal["hover", "sdre"]
+PLAN_TILT = 0.8  # rad, of models linear in the attitude
+PLAN_TURN = 0.3  # rad, of roll and pitch from sample to sample
+EXACT_TILT = 1.0  # rad, of the exact model
+SOFT_WEIGHT = 25.0  # per SI unit: keeps the corridor's limits; from 30 on, 3 m outside walls, some flip
+
+
+def require_choice(name: str, value: object, kind: Any) -> None:
+    """Check that `value` is one of the strings of a Literal type.
+
+    Raises:
+        ValueError: If it is not; names what is allowed.
+    """
+    if value not in get_args(kind):
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, get_args(kind)))}, got {shown(value)}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MpcOptions:
+    """What every MPC lets choose.
+
+    Raises:
+        ValueError: If an option is not allowed.
+    """
+
+    horizon: int = 25  # N, samples
+    solver: SolverName = "structured"  # exact in one compiled call, or "osqp"
+    frame: Frame = "heading"  # axes of the problem; "hover" is the dissertation's, for yaw near 0
+    soft_weight: float = SOFT_WEIGHT  # exact penalty per unit of a state row; inf makes the rows hard
+    margin: float = (
+        0.02  # what the plan keeps from each state limit, in its SI unit: for the unmodelled rotor lag
+    )
+    reject_disturbance: bool = False  # whether to estimate and cancel disturbances that are not revealed
+    estimator_gain: float | Literal["auto"] = (
+        "auto"  # share of each new residual in the estimate, in (0, 1];
+        # "auto" takes it from `task.sensor_noise`, 0.5 without any
+    )
+    iteration_limit: int = ITERATION_LIMIT  # active-set steps of a solve at most; 0: one that grows with it
+    Q: ArrayLike | None = None  # weight of the state: number, diagonal (12,) or matrix; None: the reward's
+    R: ArrayLike | None = None  # weight of the forces: number, diagonal (4,) or matrix; None: the reward's
+    plan_tilt: float | None = (
+        None  # rad, largest roll and pitch of a plan besides the task's limit: where the
+        # model holds; inf is no limit. None: 0.8 (exact model 1.0) in frame "heading", inf in "hover"
+    )
+    plan_rate: float | None = (
+        None  # rad/s, largest roll and pitch rate of a plan, half of it in yaw, likewise. None: 0.3 rad
+        # a sample in frame "heading", inf in "hover"
+    )
+    terminal: ArrayLike = 1.0  # factor of P, the weight of x_N, or a matrix (12, 12) in the problem's axes
+    R_rate: ArrayLike | None = (
+        None  # weight of the changes of the forces from sample to sample, the first one against the command
+        # applied before: number, diagonal (4,) or matrix; None: changes cost nothing
+    )
+
+    usual_tilt: ClassVar[float] = PLAN_TILT
+
+    def __post_init__(self) -> None:
+        require_horizon(self.horizon)
+        require_choice("solver", self.solver, SolverName)
+        require_choice("frame", self.frame, Frame)
+        if not self.soft_weight >= 0.0:
+            raise ValueError(
+                f"soft_weight must be >= 0 (math.inf for hard rows), got {shown(self.soft_weight)}"
+            )
+        if not 0.0 <= self.margin < math.inf:
+            raise ValueError(
+                f"margin must be a finite number >= 0, in SI units of each limit, got {shown(self.margin)}"
+            )
+        if self.estimator_gain != "auto" and not 0.0 < self.estimator_gain <= 1.0:
+            raise ValueError(
+                f"estimator_gain must be 'auto' or lie in (0, 1], got {shown(self.estimator_gain)}"
+            )
+        for name, unit in (("plan_tilt", "rad"), ("plan_rate", "rad/s")):
+            value = getattr(self, name)
+            if value is not None and not value > 0.0:
+                raise ValueError(f"{name} must be > 0 {unit}, got {shown(value)}; math.inf is no limit")
+        require_whole(
+            "iteration_limit (0: one that grows with the problem)", self.iteration_limit, 0, MOST_ITERATIONS
+        )
+
+    def largest_tilt(self) -> float:
+        """The tilt that a plan keeps to, rad: as chosen, else the usual one, in frame "hover" none."""
+        if self.plan_tilt is not None:
+            return self.plan_tilt
+        return self.usual_tilt if self.frame == "heading" else math.inf
+
+    def largest_rate(self, dt: float) -> float:
+        """The rate that a plan keeps to, rad/s: as chosen, else `PLAN_TURN` a sample; cf. `largest_tilt`."""
+        if self.plan_rate is not None:
+            return self.plan_rate
+        return PLAN_TURN / dt if self.frame == "heading" else math.inf
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LmpcOptions(MpcOptions):
+    """What `LinearMPC` lets choose."""
+
+    velocity_reference: LevelReference = (
+        "level"  # what is compared with v_ref in frame "heading". "level": the velocity, turned by the
+        # present attitude into the level axes of v_ref, which is the rate of the position, too.
+        # "attitude": V_B, with v_ref turned into its axes; "heading": V_B, with v_ref as it is. Both move
+        # positions by V_B: the longer the horizon, the more that costs
+    )
+
+    def __post_init__(self) -> None:
+        MpcOptions.__post_init__(self)
+        require_choice("velocity_reference", self.velocity_reference, LevelReference)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SdcOptions(MpcOptions):
+    """What `SdcNmpc` lets choose."""
+
+    alpha: float = 1.0  # member of the family of factorisations, in [0, 1]; 1/2 is the dissertation's
+    relinearisations: int | Literal["auto"] = (
+        "auto"  # further passes, each with the pairs along the plan of the pass before. "auto" makes one
+        # where the plan turns by more than 0.5 rad, none in frame "hover"; 0 is the dissertation's
+    )
+    terminal_weight: TerminalWeight = "hover"  # P of the hover model, or "sdre": P of the present pair
+    velocity_reference: PresentReference | None = (
+        None  # what is compared with v_ref, in frame "heading". "present": the velocity in axes of the
+        # present attitude, into which v_ref is turned. "heading", "attitude": V_B, which turns along the
+        # plan, with v_ref turned by the present heading, or by the whole present attitude. None: "present",
+        # or with another alpha than 1 "heading"
+    )
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.alpha <= 1.0:
+            raise ValueError(
+                f"alpha must lie in [0, 1], got {shown(self.alpha)}; 1/2 is the dissertation's, 1 recommended"
+            )
+        if not self.at_need:
+            require_whole("relinearisations, if not 'auto',", self.relinearisations, 0, MOST_PASSES)
+        require_choice("velocity_reference", self.axes(), PresentReference)
+        if self.axes() == "present" and self.alpha != 1.0:
+            raise ValueError(
+                f"velocity_reference='present' leaves out -Omega x V_B, which alpha = {self.alpha!r} splits: "
+                "take alpha=1, or 'heading' or 'attitude'"
+            )
+        require_choice("terminal_weight", self.terminal_weight, TerminalWeight)
+        MpcOptions.__post_init__(self)
+        if self.terminal_weight == "sdre" and (np.ndim(self.terminal) > 0 or self.terminal != 1.0):
+            raise ValueError(
+                "terminal changes P of the hover model; terminal_weight='sdre' has another P at each sample: "
+                "leave terminal out, or choose terminal_weight='hover'"
+            )
+
+    @property
+    def at_need(self) -> bool:
+        """Whether a further pass is made only where the plan needs it."""
+        return isinstance(self.relinearisations, str) and self.relinearisations == "auto"
+
+    def further_passes(self) -> int:
+        """Passes after the first one, at most."""
+        if self.at_need:
+            return 1 if self.frame == "heading" else 0
+        return int(self.relinearisations)
+
+    def axes(self) -> PresentReference:
+        """What is compared with v_ref."""
+        if self.velocity_reference is not None:
+            return self.velocity_reference
+        return "present" if self.frame == "heading" and self.alpha == 1.0 else "heading"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NmpcOptions(MpcOptions):
+    """What `ExactNmpc` lets choose."""
+
+    passes: int = (
+        1  # 1: real-time iteration, one QP per sample about the shifted solution; more: SQP until no input
+        # changes by 1e-6 N, 30 is ample
+    )
+    velocity_error: VelocityError = (
+        "inertial"  # V_B - R_BI(Theta) v_ref with the predicted attitude, as the reward has it; "body":
+        # V_B - v_ref, v_ref turned by the present heading (frame "heading") or not (frame "hover")
+    )
+
+    usual_tilt: ClassVar[float] = EXACT_TILT
+
+    def __post_init__(self) -> None:
+        require_whole("passes", self.passes, 1, MOST_PASSES)
+        require_choice("velocity_error", self.velocity_error, VelocityError)
+        MpcOptions.__post_init__(self)
+
+
+_Options = TypeVar("_Options", bound=MpcOptions)
+
+
+def chosen(kind: type[_Options], options: _Options | None, changes: Mapping[str, Any]) -> _Options:
+    """The options of a controller: those given or the defaults, with the fields that keywords change.
+
+    Raises:
+        TypeError: If the options are of another kind, or it has no such field; names the nearest one.
+        ValueError: If a value is not allowed.
+    """
+    if options is not None and not isinstance(options, kind):
+        raise TypeError(
+            f"options must be {kind.__name__}, got {shown(options)}; single ones are keywords, as horizon=25"
+        )
+    known = [field.name for field in fields(kind)]
+    for name in changes:
+        if name not in known:
+            raise TypeError(unknown_name(f"field of {kind.__name__}:", name, known))
+    return kind(**changes) if options is None else replace(options, **changes)
