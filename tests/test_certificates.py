@@ -146,7 +146,7 @@ def test_the_terminal_rows_look_one_step_ahead():
 
 @pytest.mark.parametrize("kind", [LinearMPC, SdcNmpc])
 def test_the_problem_of_a_decision_has_the_plan_of_that_decision(kind):
-    controller = kind(WEAK, 8)
+    controller = kind(WEAK, horizon=8)
     plant, rows = at_rest((0.5, -0.4, 0.3), (0.1, -0.2, 0.4)), window(rest, 0, 8)
     qp = controller.problem(plant, rows, np.full(4, 1.96), np.zeros(6), np.zeros(controller.memory_size))
     plan = solve_problem(qp, StructuredSolver()).u
