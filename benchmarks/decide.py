@@ -93,7 +93,7 @@ def entries(horizon: int) -> list[Entry]:
         Entry("sdc-nmpc, 1 relinearisation", ours("sdc-nmpc", relinearisations=1)),
         Entry("nmpc, RTI", ours("nmpc", **exact)),
         Entry("nmpc, SQP", ours("nmpc", passes=30, **exact)),
-        Entry("sdc-nmpc, OSQP update", ours("sdc-nmpc", solver="osqp")),
+        Entry("sdc-nmpc, OSQP set up anew", ours("sdc-nmpc", solver="osqp")),
     ]
     if importlib.util.find_spec("daqp"):
         found.append(Entry("sdc-nmpc, DAQP condensed", daqp))
