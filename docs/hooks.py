@@ -3,7 +3,7 @@
 Equations become MathML when the site is built: `pymdownx.arithmatex` has marked them, their TeX escaped as
 HTML. The one script that the theme would take from the network is the copy in docs/vendor. And tables of what
 the code knows are written from it: the columns of tables, the hyperparameters of the learners, the
-options of the MPCs.
+options of the controllers.
 """
 
 from __future__ import annotations
@@ -62,15 +62,17 @@ def hyperparameter_tables() -> str:
     return "\n".join(lines)
 
 
-def mpc_options_table() -> str:
-    """What each MPC lets choose, in Markdown, those that all have first."""
+def controller_options_table() -> str:
+    """What each controller lets choose, in Markdown; of the MPCs, what they share stands first."""
+    from controllers.feedback.options import FeedbackLinearizationOptions, LqrOptions, SdreOptions
     from controllers.mpc.options import LmpcOptions, MpcOptions, NmpcOptions, SdcOptions
     from quad_envs.field_comments import field_comments
 
     lines = []
     shared = {field.name for field in fields(MpcOptions)}
-    for kind in (MpcOptions, LmpcOptions, SdcOptions, NmpcOptions):
-        own = [f for f in fields(kind) if kind is MpcOptions or f.name not in shared]
+    mpcs = (MpcOptions, LmpcOptions, SdcOptions, NmpcOptions)
+    for kind in (*mpcs, SdreOptions, LqrOptions, FeedbackLinearizationOptions):
+        own = [f for f in fields(kind) if kind not in mpcs[1:] or f.name not in shared]
         values = {field.name: field.default for field in own}
         lines += [f"#### {kind.__name__}", "", *_rows("option", values, field_comments(kind)), ""]
     return "\n".join(lines)
@@ -86,7 +88,7 @@ _TABLES = {
     "<!-- table: columns -->": columns_table,
     "<!-- table: episode -->": episode_table,
     "<!-- table: hyperparameters -->": hyperparameter_tables,
-    "<!-- table: mpc options -->": mpc_options_table,
+    "<!-- table: controller options -->": controller_options_table,
 }
 
 

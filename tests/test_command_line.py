@@ -249,8 +249,8 @@ def test_list_shows_the_options_of_a_name(capsys, name, option):
     assert option in json.loads(capsys.readouterr().out)
 
 
-@pytest.mark.parametrize("name", ["lmpc", "sdc-nmpc", "nmpc"])
-def test_list_shows_what_each_option_of_an_mpc_means(capsys, name):
+@pytest.mark.parametrize("name", ["lmpc", "sdc-nmpc", "nmpc", "sdre", "lqr", "feedback-linearization"])
+def test_list_shows_what_each_option_of_a_controller_means(capsys, name):
     assert main(["list", name]) == 0
     printed = capsys.readouterr().out.splitlines()[1:]
     assert [line.split()[0] for line in printed] == list(policy_options(name))

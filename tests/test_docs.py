@@ -19,6 +19,7 @@ import pytest
 from baselines.__main__ import main, make_parser
 from baselines.training.algorithms import ALGORITHMS
 from controllers import LmpcOptions, NmpcOptions, SdcOptions
+from controllers.feedback.options import FeedbackLinearizationOptions, LqrOptions, SdreOptions
 from quad_envs.field_comments import field_comments
 from quad_envs.registration import TEAMS, TRACKING
 
@@ -182,10 +183,13 @@ def test_the_page_on_training_gets_every_hyperparameter_with_its_meaning():
             assert row.endswith(f"| {comment} |") and row.count("|") == 4
 
 
-def test_the_page_on_controllers_gets_every_option_of_the_mpcs_with_its_meaning():
+LAWS = (SdreOptions, LqrOptions, FeedbackLinearizationOptions)
+
+
+def test_the_page_on_controllers_gets_every_option_with_its_meaning():
     page = ROOT / "docs" / "api" / "controllers.md"
     text = script("hooks").on_page_markdown(page.read_text(encoding="utf-8"))
-    for kind in (LmpcOptions, SdcOptions, NmpcOptions):
+    for kind in (LmpcOptions, SdcOptions, NmpcOptions, *LAWS):
         for field, comment in field_comments(kind).items():
             rows = [line for line in text.splitlines() if line.startswith(f"| `{field}` |")]
             assert comment and any(line.endswith(f"| {comment} |") and line.count("|") == 4 for line in rows)

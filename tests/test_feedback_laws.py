@@ -7,8 +7,9 @@ import pytest
 from flights import HOVER, TASK, WEAK, at_rest, decide_once, fly, helix, lines, rest, window
 
 from controllers import FeedbackLinearization, Lqr, Sdre, hover_pair, lqr_gain
+from controllers.feedback.options import FeedbackLinearizationOptions, SdreOptions
 
-AGGRESSIVE = (1.76, 1.91, 36.58, 6.87)
+AGGRESSIVE = {"kp": 1.76, "kd": 1.91, "ka": 36.58, "kad": 6.87}
 
 
 def settling_time(flight):
@@ -23,6 +24,15 @@ def test_lqr_is_its_gain():
     np.testing.assert_allclose(command - HOVER, -K @ plant[:12], atol=1e-12)
 
 
+def test_the_options_of_a_law_are_a_value_whose_fields_keywords_replace():
+    assert Sdre(TASK, SdreOptions(alpha=0.5), frame="hover").options == SdreOptions(alpha=0.5, frame="hover")
+    assert FeedbackLinearization(TASK, kp=3.0).options == FeedbackLinearizationOptions(kp=3.0)
+    with pytest.raises(TypeError, match="must be LqrOptions, got SdreOptions"):
+        Lqr(TASK, SdreOptions())
+    with pytest.raises(TypeError, match=r"options must be SdreOptions, got 0\.5; .* frame="):
+        Sdre(TASK, 0.5)
+
+
 def test_sdre_is_lqr_at_hover():
     plant = at_rest((0.3, -0.2, 0.1))
     a, b = decide_once(Lqr(TASK), plant), decide_once(Sdre(TASK), plant)
@@ -30,7 +40,7 @@ def test_sdre_is_lqr_at_hover():
 
 
 def test_sdre_flies_the_published_helix():
-    flight = fly(Sdre(TASK, 0.5, frame="hover"), helix)
+    flight = fly(Sdre(TASK, alpha=0.5, frame="hover"), helix)
     assert flight.rms == pytest.approx(0.9572, rel=1e-3)
     assert flight.effort == pytest.approx(0.3569, rel=1e-3)
 
@@ -50,7 +60,7 @@ def test_feedback_laws_do_not_mind_the_heading():
 
 
 def test_feedback_linearization_regulates_as_published():
-    flight = fly(FeedbackLinearization(TASK, *AGGRESSIVE, frame="hover"), start=(1, 1, -1))
+    flight = fly(FeedbackLinearization(TASK, **AGGRESSIVE, frame="hover"), start=(1, 1, -1))
     assert flight.rms == pytest.approx(0.5029, rel=1e-3)
     assert flight.effort == pytest.approx(0.0353, rel=5e-3)
     assert settling_time(flight) == pytest.approx(2.05)
@@ -67,7 +77,7 @@ def test_default_gains_hold_with_weak_rotors(side, rms, effort, settles):
 
 
 def test_aggressive_gains_lose_the_vehicle_with_weak_rotors():
-    flight = fly(FeedbackLinearization(WEAK, *AGGRESSIVE, frame="hover"), start=(3, 3, -3))
+    flight = fly(FeedbackLinearization(WEAK, **AGGRESSIVE, frame="hover"), start=(3, 3, -3))
     tilt = np.abs(flight.plants[:, 6:8]).max(axis=1)
     assert 0.05 * np.flatnonzero(tilt > np.pi / 2)[0] == pytest.approx(3.7, abs=0.1)
 
@@ -100,7 +110,7 @@ def test_gains_must_be_positive(gain):
 
 def test_bad_options_are_named():
     for build in (
-        lambda: Sdre(TASK, 2.0),
+        lambda: Sdre(TASK, alpha=2.0),
         lambda: Sdre(TASK, frame="x"),
         lambda: Lqr(TASK, velocity_reference="x"),
     ):

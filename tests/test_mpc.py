@@ -60,7 +60,7 @@ def test_options_are_a_value_whose_fields_keywords_replace(mpc, kind):
     assert mpc(TASK, horizon=10, soft_weight=7.0).options == mpc(TASK, chosen).options == chosen
     with pytest.raises(TypeError, match=r"field of \w+Options: 'horizn'; did you mean 'horizon'\?"):
         mpc(TASK, horizn=10)
-    with pytest.raises(TypeError, match=r"options must be \w+Options, got 10; .* horizon=25"):
+    with pytest.raises(TypeError, match=r"options must be \w+Options, got 10; .* horizon="):
         mpc(TASK, 10)
     with pytest.raises(AttributeError):
         chosen.horizon = 20

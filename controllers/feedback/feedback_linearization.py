@@ -9,7 +9,6 @@ import numpy as np
 
 from quad_envs._numba import kernel
 from quad_envs.dynamics import rotor_shares
-from quad_envs.names import shown
 from quad_envs.parameters import (
     GRAVITY,
     GYRO_X,
@@ -29,8 +28,9 @@ from quad_envs.turning import turn_rate
 from ..controller import TURNING_ROWS, FeedbackLaw, first_non_finite
 from ..fallback import HOVER, NONE, limit_command, yield_yaw
 from ..mpc.kernels import governed
-from ..mpc.options import Frame, require_choice
+from ..mpc.options import chosen
 from ..qp.ocp import IntArray
+from .options import FeedbackLinearizationOptions
 
 KP, KD, KA, KAD = range(4)  # entries of the gains
 _YAW_STIFFNESS, _YAW_DAMPING = 1.0, 2.0  # 1/s^2, 1/s
@@ -166,39 +166,27 @@ class FeedbackLinearization(FeedbackLaw):
 
     Args:
         task: What is known of the flight.
-        kp: Position gain, 1/s^2.
-        kd: Velocity gain, 1/s.
-        ka: Attitude gain, 1/s^2.
-        kad: Rate gain, 1/s.
-        acceleration_feed_forward: Whether to add the acceleration of the reference, by differences of v_ref,
-            where the window has two rows.
-        frame: "heading", or "hover": as in the text, (u_1, u_2) are not turned and the yaw error not wrapped.
+        options: See `FeedbackLinearizationOptions`; None for the defaults.
+        changes: Fields of it by name, which replace those of `options`.
 
     Raises:
-        ValueError: If a gain is not positive and finite, or the frame is unknown.
+        TypeError: If there is no such option.
+        ValueError: If an option is not allowed.
     """
 
+    options_type = FeedbackLinearizationOptions
+
     def __init__(
-        self,
-        task: Task,
-        kp: float = 2.0,
-        kd: float = 2.5,
-        ka: float = 36.0,
-        kad: float = 11.0,
-        acceleration_feed_forward: bool = True,
-        *,
-        frame: Frame = "heading",
+        self, task: Task, options: FeedbackLinearizationOptions | None = None, **changes: Any
     ) -> None:
-        require_choice("frame", frame, Frame)
-        for name, value in (("kp", kp), ("kd", kd), ("ka", ka), ("kad", kad)):
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name} must be a finite number > 0, got {shown(value)}")
+        options = chosen(FeedbackLinearizationOptions, options, changes)
+        self.options = options
         self.task = task
-        self.horizon = 1 if acceleration_feed_forward else 0
-        self._gains = np.array([kp, kd, ka, kad], dtype=np.float64)
+        self.horizon = 1 if options.acceleration_feed_forward else 0
+        self._gains = np.array([options.kp, options.kd, options.ka, options.kad], dtype=np.float64)
         self._constants = (
             task.params.coefficients(),
-            frame == "heading",
+            options.frame == "heading",
             float(task.dt),
             task.force_max,
             float(task.limits.rate * task.dt),

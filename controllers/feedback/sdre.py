@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from quad_envs._numba import kernel
-from quad_envs.names import shown
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 from quad_envs.tasks import Task
 
@@ -18,10 +17,11 @@ from ..disturbance import feed_forward
 from ..fallback import CLIPPED_SDRE, HOVER, NONE, limit_command, yield_yaw
 from ..model import hover_pair, sdc_matrix, sdc_pair, zero_order_hold
 from ..mpc.kernels import add_rotor_lag, copy_vector, rotor_lag, set_references, set_state
-from ..mpc.options import Frame, VelocityReference, require_choice
+from ..mpc.options import chosen
 from ..qp.linalg import copy
 from ..qp.ocp import IntArray, OcpQp, no_rows
 from ..qp.riccati import DARE_SCRATCH, dare, lqr_gain, solve_dare, stage_gains
+from .options import LqrOptions, SdreOptions, StateFeedbackOptions
 
 _MATRICES = DARE_SCRATCH + 6
 
@@ -118,42 +118,33 @@ class Sdre(FeedbackLaw):
 
     Args:
         task: What is known of the flight.
-        alpha: Member of the family of factorisations, in [0, 1]; see `model.sdc_matrix`.
-        frame: "heading" or "hover", see `LinearMPC`.
-        velocity_reference: "heading" or "attitude", see `SdcOptions`.
+        options: See `SdreOptions`; None for the defaults.
+        changes: Fields of it by name, which replace those of `options`.
 
     Raises:
+        TypeError: If there is no such option.
         ValueError: If an option is not allowed.
     """
 
     horizon = 0
+    options_type: ClassVar[type[StateFeedbackOptions]] = SdreOptions
 
-    def __init__(
-        self,
-        task: Task,
-        alpha: float = 1.0,
-        *,
-        frame: Frame = "heading",
-        velocity_reference: VelocityReference = "heading",
-    ) -> None:
-        if not 0.0 <= alpha <= 1.0:
-            raise ValueError(
-                f"alpha must lie in [0, 1], got {shown(alpha)}; 1/2 is the dissertation's, 1 recommended"
-            )
-        self._prepare(task, float(alpha), frame, velocity_reference)
+    def __init__(self, task: Task, options: SdreOptions | None = None, **changes: Any) -> None:
+        options = chosen(SdreOptions, options, changes)
+        self._prepare(task, options, float(options.alpha))
 
-    def _prepare(self, task: Task, alpha: float, frame: Frame, velocity_reference: VelocityReference) -> None:
+    def _prepare(self, task: Task, options: StateFeedbackOptions, alpha: float) -> None:
         """Constants; alpha < 0 for the gain at hover."""
-        require_choice("frame", frame, Frame)
-        require_choice("velocity_reference", velocity_reference, VelocityReference)
+        self.options = options
         self.task = task
         self.alpha = alpha
+        heading = options.frame == "heading"
         Q, R = task.weights.Q_matrix(), task.weights.R_matrix()
         K, _ = lqr_gain(*hover_pair(task.params, task.dt), Q, R)
         self._constants: tuple[Any, ...] = (
             alpha,
-            frame == "heading",
-            frame == "heading" and velocity_reference == "attitude",
+            heading,
+            heading and options.velocity_reference == "attitude",
             task.params.coefficients(),
             task.params.input_matrix(),
             Q,
@@ -208,14 +199,15 @@ class Lqr(Sdre):
 
     Args:
         task: What is known of the flight.
-        frame: "heading" or "hover", see `LinearMPC`.
-        velocity_reference: "heading" or "attitude", see `SdcOptions`; "attitude" costs up to 3 times less.
+        options: See `LqrOptions`; None for the defaults.
+        changes: Fields of it by name, which replace those of `options`.
 
     Raises:
+        TypeError: If there is no such option.
         ValueError: If an option is not allowed.
     """
 
-    def __init__(
-        self, task: Task, *, frame: Frame = "heading", velocity_reference: VelocityReference = "attitude"
-    ) -> None:
-        self._prepare(task, -1.0, frame, velocity_reference)
+    options_type = LqrOptions
+
+    def __init__(self, task: Task, options: LqrOptions | None = None, **changes: Any) -> None:
+        self._prepare(task, chosen(LqrOptions, options, changes), -1.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +16,9 @@ from quad_envs.names import shown, unknown_name
 from ..controller import MOST_PASSES, require_horizon
 from ..qp.solution import MOST_ITERATIONS
 from ..qp.structured import ITERATION_LIMIT
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 SolverName = Literal["structured", "osqp"]
 Frame = Literal["heading", "hover"]
@@ -210,21 +213,22 @@ class NmpcOptions(MpcOptions):
         MpcOptions.__post_init__(self)
 
 
-_Options = TypeVar("_Options", bound=MpcOptions)
+_Options = TypeVar("_Options", bound="DataclassInstance")
 
 
 def chosen(kind: type[_Options], options: _Options | None, changes: Mapping[str, Any]) -> _Options:
-    """The options of a controller: those given or the defaults, with the fields that keywords change.
+    """Options of a controller: those given, or the defaults, with the fields that keywords change.
 
     Raises:
         TypeError: If the options are of another kind, or it has no such field; names the nearest one.
         ValueError: If a value is not allowed.
     """
+    known = [field.name for field in fields(kind)]
     if options is not None and not isinstance(options, kind):
         raise TypeError(
-            f"options must be {kind.__name__}, got {shown(options)}; single ones are keywords, as horizon=25"
+            f"options must be {kind.__name__}, got {shown(options)}; "
+            f"single ones are keywords, as {known[0]}=..."
         )
-    known = [field.name for field in fields(kind)]
     for name in changes:
         if name not in known:
             raise TypeError(unknown_name(f"field of {kind.__name__}:", name, known))
