@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from quad_envs.lazy import load_public, public_names
-
 if TYPE_CHECKING:
     from .benchmark import run_benchmark
     from .errors import CheckpointError, PolicyCheckError, PolicyError, ResultsError, TrainingError
@@ -98,8 +96,14 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
+    from quad_envs.lazy import (
+        load_public,  # not before: it loads Gymnasium, and `quad-envs --help` has to be quick
+    )
+
     return load_public(__name__, _PUBLIC, name)
 
 
 def __dir__() -> list[str]:
+    from quad_envs.lazy import public_names
+
     return public_names(globals())

@@ -323,3 +323,11 @@ def test_doctor_names_a_package_of_the_same_name(monkeypatch):
     )
     finding = doctor._shadowing()
     assert not finding.ok and "webapp also installs a package controllers" in finding.detail
+
+
+def test_help_loads_neither_numpy_nor_gymnasium():
+    """It has to be there at once: 0.07 CPU-s, with them 0.4."""
+    code = "import sys, baselines.__main__ as m\ntry: m.main(['--help'])\nexcept SystemExit: pass\n"
+    loaded = "print(*{'numpy', 'gymnasium', 'numba', 'quad_envs'} & {*sys.modules}, file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", code + loaded], capture_output=True, text=True, check=True)
+    assert done.stderr.strip() == ""
