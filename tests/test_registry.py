@@ -151,3 +151,13 @@ def test_default_flights_stay_inside_the_spaces():
         observation, _ = env.reset(seed=0)
         assert env.observation_space.contains(observation)
         assert env.observation_space.contains(env.step(np.zeros(4, np.float32))[0])
+
+
+def test_solvers_are_found_by_their_paths_of_before():
+    from controllers.ocp import OcpQp
+    from controllers.riccati import dare
+    from controllers.solvers import StructuredSolver
+
+    from controllers import qp
+
+    assert (OcpQp, dare, StructuredSolver) == (controllers.OcpQp, controllers.dare, qp.StructuredSolver)
