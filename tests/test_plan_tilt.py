@@ -99,4 +99,4 @@ def test_whatever_the_weights_nobody_loses_a_vehicle_and_sdc_nmpc_is_no_worse_th
                 for name in ("lmpc", "sdc-nmpc", "nmpc")
             }
             assert not any(record.crashed for record in found.values()), (position, rest)
-            assert found["sdc-nmpc"].cost <= 1.02 * found["lmpc"].cost, (position, rest)
+            assert found["sdc-nmpc"].quadratic_cost <= 1.02 * found["lmpc"].quadratic_cost, (position, rest)
