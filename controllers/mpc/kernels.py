@@ -1,6 +1,6 @@
 """One sample of an MPC in compiled form: what comes before the solve, the fallbacks, and what comes after it.
 
-The flavours (`lmpc.py`, `sdc_nmpc.py`, `nmpc.py`) add how the pairs (A_i, B_i) and affine terms c_i are made.
+The flavours (`lmpc.py`, `sdc.py`, `exact.py`) add how the pairs (A_i, B_i) and affine terms c_i are made.
 
 Memory of one vehicle: whether a plan is held, the plan's rotor commands (N x 4), the solver's working set
 (N), then, with `reject_disturbance`, the estimator's ESTIMATOR_SIZE numbers, then what the flavour keeps.

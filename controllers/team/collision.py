@@ -306,7 +306,7 @@ def separation_rows(
     other: Array,
     work: Array,
 ) -> int:
-    """Normals and lower bounds of one vehicle's rows, in the heading frame of `mpc_kernels`, packed.
+    """Normals and lower bounds of one vehicle's rows, in the heading frame of `mpc.kernels`, packed.
 
     Args:
         plant: Measured, (16,); its position is not read.

@@ -281,7 +281,7 @@ def observe_agent(
     team: Array,
     out: NDArray[np.float32],
 ) -> None:
-    """Write the observation of vehicle i, `agent_observations.AgentLayout`.
+    """Write the observation of vehicle i, `observations.team.AgentLayout`.
 
     Args:
         i: Vehicle of the team.
