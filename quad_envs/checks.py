@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
-import numpy as np
-
-from .kinds import is_number
+from .kinds import is_number, is_whole
 from .names import shown
 
 _GIB = 2.0**30
@@ -45,6 +43,16 @@ def require_number(what: str, value: Any, bound: Bound) -> None:
     raise ValueError(f"{what} must be {bound}, got {shown(value)}{reason}")
 
 
+def require_choice(name: str, value: object, kind: Any) -> None:
+    """Check that `value` is one of the strings of a Literal type.
+
+    Raises:
+        ValueError: If it is not; names what is allowed.
+    """
+    if value not in get_args(kind):
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, get_args(kind)))}, got {shown(value)}")
+
+
 def require_whole(
     what: str,
     value: Any,
@@ -64,7 +72,7 @@ def require_whole(
     Raises:
         ValueError: If it is not.
     """
-    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    whole = is_whole(value)
     if whole and value >= least and (most is None or value <= most):
         return
     allowed, taken = f">= {least}", ""

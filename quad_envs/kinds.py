@@ -144,7 +144,7 @@ def _require_alike(what: str, value: Any, default: Any) -> None:
     if isinstance(default, bool):
         fits, wanted = isinstance(value, bool), "true or false"
     elif isinstance(default, int):
-        fits, wanted = isinstance(value, int | np.integer) and not isinstance(value, bool), "a whole number"
+        fits, wanted = is_whole(value), "a whole number"
     elif isinstance(default, float):
         fits, wanted = is_number(value), f"a finite number, as {default!r}"
     elif isinstance(default, tuple) and all(map(is_number, default)):
@@ -164,6 +164,11 @@ def is_number(value: Any) -> TypeGuard[float]:
         return math.isfinite(value)
     except OverflowError:  # an integer beyond all floats
         return False
+
+
+def is_whole(value: Any) -> TypeGuard[int]:
+    """Whether it is an integer; True and False are none."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
 def is_limit(value: Any) -> TypeGuard[float]:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import gymnasium
 import pytest
+from commands import fails
 from processes import start_command
 
 from baselines.__main__ import COMMANDS, main
@@ -24,17 +25,6 @@ from quad_envs.registration import TEAMS, TRACKING
 
 HELIX = "quad/HelixTracking-v0"
 RUN = [sys.executable, "-m", "baselines"]
-
-
-def fails(capsys, *arguments):
-    """The one line that bad input gets."""
-    try:
-        code = main(arguments)
-    except SystemExit as end:
-        code = end.code
-    out, err = capsys.readouterr()
-    assert code == 2 and out == "" and err.count("\n") == 1 and "Traceback" not in err
-    return err
 
 
 def test_evaluate_prints_a_table(capsys):

@@ -7,25 +7,14 @@ import subprocess
 import sys
 
 import pytest
+from commands import fails
 
-from baselines.__main__ import main
 from quad_envs.names import shortened
 
 HELIX = "quad/HelixTracking-v0"
 RUN = f"{sys.executable} -m baselines"
 LONG = "x" * 100_000
 SUITE = 'policies = ["hover"]\nenvs = ["quad/HelixTracking-v0"]\nepisodes = 1\n'
-
-
-def fails(capsys, *arguments):
-    """The one line that bad input gets."""
-    try:
-        code = main(arguments)
-    except SystemExit as end:
-        code = end.code
-    out, err = capsys.readouterr()
-    assert code == 2 and out == "" and err.count("\n") == 1 and "Traceback" not in err
-    return err
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from flights import at_rest, decide_once, plan_of
 import quad_envs  # noqa: F401  registers the ids
 from baselines import evaluate, make_policy
 from controllers import ExactNmpc, LinearMPC, SdcNmpc
-from controllers.mpc.kernels import leaves_tilt
+from controllers.mpc.kernels import leaves_bound
 from quad_envs.parameters import Limits
 from quad_envs.tasks import Task
 
@@ -51,12 +51,17 @@ def test_both_solvers_keep_to_the_tilt(flavour):
     np.testing.assert_allclose(approximate, exact, atol=1e-2)
 
 
-def test_leaves_tilt_looks_at_roll_and_pitch_of_what_is_planned():
-    x = np.zeros((4, 12))
+def test_leaves_bound_looks_at_what_is_planned_and_has_a_bound():
+    x, tilt, none = np.zeros((4, 12)), np.full(12, np.inf), np.full(12, np.inf)
+    tilt[6:8] = 0.8
     x[0, 6] = x[3, 8] = 2.0  # the present roll and a yaw do not count
-    assert not leaves_tilt(x, 0.8)
+    assert not leaves_bound(x, tilt)
     x[2, 7] = -0.9
-    assert leaves_tilt(x, 0.8) and not leaves_tilt(x, np.inf)
+    assert leaves_bound(x, tilt) and not leaves_bound(x, none)
+    x[2, 7], tilt[11] = 0.0, 3.0
+    assert not leaves_bound(x, tilt)
+    x[1, 11] = 3.1  # a body rate
+    assert leaves_bound(x, tilt)
 
 
 @pytest.mark.parametrize("tilt", [0.0, -1.0, np.nan])

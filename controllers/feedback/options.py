@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from quad_envs.checks import require_choice
 from quad_envs.names import shown
 
-from ..mpc.options import Frame, VelocityReference, require_choice
+from ..mpc.options import Frame, VelocityReference, require_alpha
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,10 +47,7 @@ class SdreOptions(StateFeedbackOptions):
     alpha: float = 1.0  # member of the family of factorisations, in [0, 1]; 1/2 is the dissertation's
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.alpha <= 1.0:
-            raise ValueError(
-                f"alpha must lie in [0, 1], got {shown(self.alpha)}; 1/2 is the dissertation's, 1 recommended"
-            )
+        require_alpha(self.alpha)
         StateFeedbackOptions.__post_init__(self)
 
 

@@ -20,7 +20,7 @@ from quad_envs.turning import turn_rate
 from ..disturbance import ESTIMATOR_SCRATCH, N_DISTURBANCE, feed_forward, remember, update_estimate
 from ..fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXED_WEIGHT, limit_command
 from ..qp.active_set import INACCURATE, INFEASIBLE, OPTIMAL
-from ..qp.linalg import copy
+from ..qp.linalg import copy, take, take_blocks
 from ..qp.ocp import IntArray
 from ..qp.riccati import DARE_SCRATCH
 from ..qp.structured import Workspace, solve_structured
@@ -118,41 +118,35 @@ def copy_vector(x: Array, out: Array) -> None:
 
 
 @kernel
-def _take(buffer: Array, start: int, rows: int, columns: int) -> Array:
-    """The next matrix of the buffer."""
-    return buffer[start : start + rows * columns].reshape(rows, columns)
-
-
-@kernel
 def carve(buffer: Array, N: int, pairs: int, H: int, K: int, M: int) -> Scratch:
     """Views of the buffer; one array is unpacked at the call from Python instead of two dozen."""
     n, m, e = N_STATE, N_INPUT, N_DISTURBANCE
-    v = _take(buffer, 0, 1, 2 * n + 4 * m + 2 * e + ESTIMATOR_SCRATCH)[0]
+    v = take(buffer, 0, 1, 2 * n + 4 * m + 2 * e + ESTIMATOR_SCRATCH)[0]
     i = v.shape[0]
-    working = _take(buffer, i, 1, N)[0]
+    working = take(buffer, i, 1, N)[0]
     i += N
-    r = _take(buffer, i, N + 1, n)
+    r = take(buffer, i, N + 1, n)
     i += r.size
-    c = _take(buffer, i, N, n)
+    c = take(buffer, i, N, n)
     i += c.size
-    A = _take(buffer, i, pairs * n, n).reshape(pairs, n, n)
+    A = take_blocks(buffer, i, pairs, n, n)
     i += A.size
-    B = _take(buffer, i, pairs * n, m).reshape(pairs, n, m)
+    B = take_blocks(buffer, i, pairs, n, m)
     i += B.size
-    square = _take(buffer, i, (2 + DARE_SCRATCH) * n, n).reshape(2 + DARE_SCRATCH, n, n)
+    square = take_blocks(buffer, i, 2 + DARE_SCRATCH, n, n)
     i += square.size
-    normals = _take(buffer, i, H, n)
+    normals = take(buffer, i, H, n)
     i += normals.size
-    rows = _take(buffer, i, 3, K)
+    rows = take(buffer, i, 3, K)
     i += rows.size
-    Q = _take(buffer, i, M * n, n).reshape(M, n, n)
+    Q = take_blocks(buffer, i, M, n, n)
     i += Q.size
-    target = _take(buffer, i, M + 1, n)
+    target = take(buffer, i, M + 1, n)
     i += target.size
-    X = _take(buffer, i, M + 1, n)
+    X = take(buffer, i, M + 1, n)
     i += X.size
-    F = _take(buffer, i, M, m)
-    points = _take(buffer, i + F.size, pairs, n)
+    F = take(buffer, i, M, m)
+    points = take(buffer, i + F.size, pairs, n)
     o = 2 * n + 4 * m
     return Scratch(
         v[:n], v[n : 2 * n], v[2 * n : 2 * n + m], v[2 * n + m : 2 * n + 2 * m],
@@ -481,15 +475,6 @@ def leaves_bound(x: Array, bound: Array) -> bool:
 
 
 @kernel
-def leaves_tilt(x: Array, tilt: float) -> bool:
-    """Whether a plan (N+1, 12) rolls or pitches beyond an angle, rad."""
-    for i in range(1, x.shape[0]):
-        if abs(x[i, 6]) > tilt or abs(x[i, 7]) > tilt:
-            return True
-    return False
-
-
-@kernel
 def solve_within_model(
     A: Array,
     B: Array,
@@ -537,11 +522,13 @@ def left_model(level: int, x_0: Array, x: Array, points: Array, model_tilt: floa
     if level == PREVIOUS_PLAN or level == HOVER:
         return False
     for i in range(1, x.shape[0]):
+        if abs(x[i, 6]) > tilt or abs(x[i, 7]) > tilt:
+            return True
         point = points[min(i, points.shape[0] - 1)]
         for a in range(first_angle, 9):
             if abs(x[i, a] - point[a]) > span:
                 return True
-    return leaves_tilt(x, tilt)
+    return False
 
 
 @kernel

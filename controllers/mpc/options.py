@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quad_envs.checks import require_whole
+from quad_envs.checks import require_choice, require_whole
 from quad_envs.names import shown, unknown_name
 
 from ..controller import MOST_PASSES, require_horizon
@@ -34,14 +34,16 @@ EXACT_TILT = 1.0  # rad, of the exact model
 SOFT_WEIGHT = 25.0  # per SI unit: keeps the corridor's limits; from 30 on, 3 m outside walls, some flip
 
 
-def require_choice(name: str, value: object, kind: Any) -> None:
-    """Check that `value` is one of the strings of a Literal type.
+def require_alpha(alpha: float) -> None:
+    """Check that alpha is a member of the family of factorisations, see `model.sdc_matrix`.
 
     Raises:
-        ValueError: If it is not; names what is allowed.
+        ValueError: If it is not.
     """
-    if value not in get_args(kind):
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, get_args(kind)))}, got {shown(value)}")
+    if not 0.0 <= alpha <= 1.0:
+        raise ValueError(
+            f"alpha must lie in [0, 1], got {shown(alpha)}; 1/2 is the dissertation's, 1 recommended"
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,10 +156,7 @@ class SdcOptions(MpcOptions):
     )
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.alpha <= 1.0:
-            raise ValueError(
-                f"alpha must lie in [0, 1], got {shown(self.alpha)}; 1/2 is the dissertation's, 1 recommended"
-            )
+        require_alpha(self.alpha)
         if not self.at_need:
             require_whole("relinearisations, if not 'auto',", self.relinearisations, 0, MOST_PASSES)
         require_choice("velocity_reference", self.axes(), PresentReference)

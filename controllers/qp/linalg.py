@@ -67,6 +67,18 @@ def add_matvec_transposed(A: Array, x: Array, sign: float, out: Array) -> None:
 
 
 @kernel
+def take(buffer: Array, start: int, rows: int, columns: int) -> Array:
+    """The next matrix of a buffer, a view: many arrays travel as one, which is unpacked once."""
+    return buffer[start : start + rows * columns].reshape(rows, columns)
+
+
+@kernel
+def take_blocks(buffer: Array, start: int, blocks: int, rows: int, columns: int) -> Array:
+    """As `take`, for several matrices of one shape."""
+    return buffer[start : start + blocks * rows * columns].reshape(blocks, rows, columns)
+
+
+@kernel
 def copy(A: Array, out: Array) -> None:
     """A (n, m) into out. A slice assignment would compile four times as long."""
     for i in range(A.shape[0]):

@@ -17,7 +17,7 @@ from typing import NamedTuple
 from quad_envs._numba import kernel
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 
-from .linalg import copy, fill, lu_solve, matmul
+from .linalg import copy, fill, lu_solve, matmul, take_blocks
 from .riccati import RICCATI_SCRATCH, optimal_plan, riccati_pass
 
 _SIZE = N_STATE + N_INPUT
@@ -54,38 +54,32 @@ def rate_size(horizon: int, n_models: int) -> int:
 
 
 @kernel
-def _take(buffer: Array, start: int, blocks: int, rows: int, columns: int) -> Array:
-    """The next matrices of the buffer."""
-    return buffer[start : start + blocks * rows * columns].reshape(blocks, rows, columns)
-
-
-@kernel
 def carve_rate(buffer: Array, N: int, M: int) -> RateWorkspace:
     """Views of the buffer: one array is unpacked at a call from Python instead of eighteen."""
     n, m = _SIZE, N_INPUT
-    A = _take(buffer, 0, M, n, n)
+    A = take_blocks(buffer, 0, M, n, n)
     i = A.size
-    B = _take(buffer, i, M, n, m)
+    B = take_blocks(buffer, i, M, n, m)
     i += B.size
-    transposed = _take(buffer, i, M, n + m, n)
+    transposed = take_blocks(buffer, i, M, n + m, n)
     i += transposed.size
-    square = _take(buffer, i, 2 * N + 1, n, n)
+    square = take_blocks(buffer, i, 2 * N + 1, n, n)
     i += square.size
-    gains = _take(buffer, i, 2 * N, m, n)
+    gains = take_blocks(buffer, i, 2 * N, m, n)
     i += gains.size
-    stages = _take(buffer, i, 2, N, n)
+    stages = take_blocks(buffer, i, 2, N, n)
     i += stages.size
-    points = _take(buffer, i, 2, N + 1, n)
+    points = take_blocks(buffer, i, 2, N + 1, n)
     i += points.size
-    small = _take(buffer, i, 2, m, m)
+    small = take_blocks(buffer, i, 2, m, m)
     i += small.size
-    v = _take(buffer, i, 1, N, m)[0]
+    v = take_blocks(buffer, i, 1, N, m)[0]
     i += v.size
     x_0 = buffer[i : i + n]
     i += n
-    wide = _take(buffer, i, 2, n, m * N)
+    wide = take_blocks(buffer, i, 2, n, m * N)
     i += wide.size
-    scratch = _take(buffer, i, RICCATI_SCRATCH, n, n)
+    scratch = take_blocks(buffer, i, RICCATI_SCRATCH, n, n)
     return RateWorkspace(
         A, B, stages[0], square[:N], square[2 * N], small[0], small[1], x_0, points[0], transposed, gains[:N],
         gains[N:], square[N : 2 * N], stages[1], v, points[1], wide, scratch,

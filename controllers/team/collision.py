@@ -34,11 +34,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from quad_envs._numba import inline_kernel, kernel
+from quad_envs.checks import require_choice
 from quad_envs.names import shown
 from quad_envs.observations.team import COMM_AGE, COMM_WEIGHT, N_COMM, N_PLAN_STAGE
 from quad_envs.parameters import N_STATE, Array
@@ -77,14 +78,8 @@ class AvoidanceOptions:
     margin: float = 0.03  # m, of the rule "reciprocal": what the plan keeps beyond the separation
 
     def __post_init__(self) -> None:
-        for name, value, kind in (
-            ("avoidance", self.rule, AvoidanceRule),
-            ("avoidance set", self.neighbours, AvoidanceSet),
-        ):
-            if value not in get_args(kind):
-                raise ValueError(
-                    f"{name} must be one of {', '.join(map(repr, get_args(kind)))}, got {shown(value)}"
-                )
+        require_choice("avoidance", self.rule, AvoidanceRule)
+        require_choice("avoidance set", self.neighbours, AvoidanceSet)
         if not 0.0 <= self.braking_time < math.inf:
             raise ValueError(f"braking_time must be finite and >= 0 s, got {shown(self.braking_time)}")
         if not abs(self.swirl) < math.pi / 2:

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quad_envs._numba import kernel
+from quad_envs.checks import require_choice
 from quad_envs.observations.team import N_COMM, N_PLAN_STAGE
 from quad_envs.observations.tracking import N_REFERENCE
 from quad_envs.parameters import Array
@@ -51,14 +52,8 @@ class ConsensusOptions:
     target: TargetModel = "cv"  # the target moves on over the horizon, or stays (the dissertation)
 
     def __post_init__(self) -> None:
-        for name, value, kind in (
-            ("neighbour", self.neighbour, Neighbour),
-            ("target", self.target, TargetModel),
-        ):
-            if value not in get_args(kind):
-                raise ValueError(
-                    f"{name} must be one of {', '.join(map(repr, get_args(kind)))}, got {value!r}"
-                )
+        require_choice("neighbour", self.neighbour, Neighbour)
+        require_choice("target", self.target, TargetModel)
         if self.attitude and self.neighbour != "ca":
             raise ValueError(
                 f"attitude needs the neighbours' accelerations: set neighbour='ca', got {self.neighbour!r}"

@@ -17,6 +17,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quad_envs.checks import require_choice
 from quad_envs.names import shown
 from quad_envs.observations.team import N_PLAN_STAGE, N_SENSED
 from quad_envs.observations.tracking import N_REFERENCE
@@ -27,7 +28,7 @@ from ..controller import PLANT_SIZE, as_array, require_horizon
 from ..disturbance import ESTIMATOR_SIZE, N_DISTURBANCE
 from ..mpc.kernels import MEMORY_STAGE, buffer_size, carve
 from ..mpc.mpc import mpc_data
-from ..mpc.options import MpcOptions, require_choice
+from ..mpc.options import MpcOptions
 from ..qp.ocp import IntArray, OcpQp, StateRows, concatenate_rows
 from ..qp.structured import ITERATION_LIMIT, make_workspace
 from .collision import COLLISION_SCRATCH, AvoidanceOptions, AvoidanceRule, AvoidanceSet, time_to_stop
