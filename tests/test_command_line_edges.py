@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import subprocess
 import sys
 
@@ -12,7 +13,7 @@ from commands import fails
 from quad_envs.names import shortened
 
 HELIX = "quad/HelixTracking-v0"
-RUN = f"{sys.executable} -m baselines"
+RUN = f"{shlex.quote(sys.executable)} -m baselines"
 LONG = "x" * 100_000
 SUITE = 'policies = ["hover"]\nenvs = ["quad/HelixTracking-v0"]\nepisodes = 1\n'
 

@@ -23,6 +23,17 @@ from baselines.training.runs import train
 HELIX = "quad/HelixTracking-v0"
 
 
+@pytest.fixture(autouse=True)
+def hears_signals():
+    """Whatever these tests were started from: a shell lets what runs in its background ignore Ctrl-C."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 def press(number=signal.SIGINT):
     os.kill(os.getpid(), number)
     time.sleep(0.01)  # until Python has run the handler
