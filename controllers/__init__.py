@@ -1,59 +1,15 @@
-"""Control of a vehicle and of teams: linear, state-dependent and exact MPC, feedback laws, and solvers."""
+"""Control of a vehicle and of teams: linear, state-dependent and exact MPC, feedback laws, and solvers.
+
+The public names stand in `__init__.pyi`; each loads at first use.
+"""
 
 import sys
+from importlib import import_module
 
-from quad_envs.lazy import public_names
+import lazy_loader
 
-from . import qp
-from .controller import Controller, Decision
-from .fallback import Fallback
-from .feedback.feedback_linearization import FeedbackLinearization
-from .feedback.sdre import Lqr, Sdre
-from .model import hover_pair, sdc_pair
-from .mpc.exact import ExactNmpc
-from .mpc.lmpc import LinearMPC
-from .mpc.options import LmpcOptions, NmpcOptions, SdcOptions
-from .mpc.sdc import SdcNmpc
-from .qp import ocp, riccati
-from .qp.ocp import OcpQp, StateRows
-from .qp.riccati import dare, lqr_gain
-from .team.collision import AvoidanceOptions
-from .team.consensus import ConsensusOptions, TargetEstimate, consensus_reference
-from .team.cooperative import CooperativeDecision, CooperativeMpc
-
-__all__ = [
-    "AvoidanceOptions",
-    "ConsensusOptions",
-    "Controller",
-    "CooperativeDecision",
-    "CooperativeMpc",
-    "Decision",
-    "ExactNmpc",
-    "Fallback",
-    "FeedbackLinearization",
-    "LinearMPC",
-    "LmpcOptions",
-    "Lqr",
-    "NmpcOptions",
-    "OcpQp",
-    "SdcNmpc",
-    "SdcOptions",
-    "Sdre",
-    "StateRows",
-    "TargetEstimate",
-    "consensus_reference",
-    "dare",
-    "hover_pair",
-    "lqr_gain",
-    "sdc_pair",
-]
-
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 # Modules that others import by their paths of before: the solvers, the data and the equations of the OCP-QP.
-solvers = qp
-for _path, _module in {"solvers": solvers, "ocp": ocp, "riccati": riccati}.items():
-    sys.modules[f"{__name__}.{_path}"] = _module
-
-
-def __dir__() -> list[str]:
-    return public_names(globals(), "estimation", "qp")
+for _former, _path in {"solvers": "qp", "ocp": "qp.ocp", "riccati": "qp.riccati"}.items():
+    sys.modules[f"{__name__}.{_former}"] = import_module(f".{_path}", __name__)

@@ -1,7 +1,5 @@
 """Every registered id passes the checkers of its users, and importing the package stays cheap."""
 
-import ast
-import inspect
 import re
 import subprocess
 import sys
@@ -65,18 +63,8 @@ def test_every_public_name_exists_and_is_in_dir(package):
         assert getattr(package, name) is not None
     assert set(package.__all__) <= set(dir(package))
     assert not [name for name in dir(package) if name.startswith("_") and not name.endswith("__")]
-    with pytest.raises(AttributeError, match="no attribute 'Nonsense'"):
+    with pytest.raises(AttributeError, match="attribute Nonsense"):
         _ = package.Nonsense
-
-
-@pytest.mark.parametrize("package", [quad_envs, baselines], ids=lambda package: package.__name__)
-def test_names_for_readers_for_type_checkers_and_for_loading_are_the_same(package):
-    """`__all__` and the imports under TYPE_CHECKING are for tools that do not run the package."""
-    tree = ast.parse(inspect.getsource(package))
-    shown = next(node for node in tree.body if isinstance(node, ast.If))
-    checked = {alias.name: node.module for node in shown.body for alias in node.names}
-    assert checked == package._PUBLIC
-    assert list(package.__all__) == sorted(package._PUBLIC)
 
 
 def test_public_names_are_listed_before_anything_is_loaded():

@@ -5,28 +5,20 @@ Torch is needed by `policy_gradient` and `imitation`, once they train, and by `t
 imported. Only the generators of `algorithms` import those; runs, plans, hyperparameters and networks do not.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from ..policies.checkpoints import load_checkpoint, save_checkpoint
-    from ..policies.network import Features, Network, NetworkPolicy
-
-# Public name -> module; loaded at first use, so that evaluating a network loads no torch.
-_PUBLIC = {
-    "Features": "baselines.policies.network",
-    "Network": "baselines.policies.network",
-    "NetworkPolicy": "baselines.policies.network",
-    "load_checkpoint": "baselines.policies.checkpoints",
-    "save_checkpoint": "baselines.policies.checkpoints",
+# Names that were here before they moved to the policies.
+_FORMER = {
+    "Features": "network",
+    "Network": "network",
+    "NetworkPolicy": "network",
+    "load_checkpoint": "checkpoints",
+    "save_checkpoint": "checkpoints",
 }
-
-__all__ = ["Features", "Network", "NetworkPolicy", "load_checkpoint", "save_checkpoint"]
 
 
 def __getattr__(name: str) -> Any:
-    if name in _PUBLIC:
-        return getattr(import_module(_PUBLIC[name]), name)
+    if name in _FORMER:
+        return getattr(import_module(f"baselines.policies.{_FORMER[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,40 @@
+# The public names, once: type checkers read this file, and `__init__.py` loads by it.
+from . import cooperative_estimation_v0 as cooperative_estimation_v0
+from . import formation_v0 as formation_v0
+from . import target_tracking_v0 as target_tracking_v0
+from .array_info import ArrayInfo as ArrayInfo
+from .disturbances import Gusts as Gusts
+from .disturbances import Impulse as Impulse
+from .disturbances import Steady as Steady
+from .disturbances import TorquePulse as TorquePulse
+from .formations import make_formation as make_formation
+from .graphs import Switching as Switching
+from .graphs import Timed as Timed
+from .graphs import adjacency as adjacency
+from .graphs import make_graph as make_graph
+from .graphs import toward_leader as toward_leader
+from .parameters import Limits as Limits
+from .parameters import QuadrotorParams as QuadrotorParams
+from .parameters import Weights as Weights
+from .references import Heading as Heading
+from .references import Helix as Helix
+from .references import Lemniscate as Lemniscate
+from .references import Line as Line
+from .references import OutAndBack as OutAndBack
+from .references import Racetrack as Racetrack
+from .references import RandomSmooth as RandomSmooth
+from .references import Reference as Reference
+from .references import SetPoint as SetPoint
+from .references import SphericalSpiral as SphericalSpiral
+from .references import from_csv as from_csv
+from .references import from_function as from_function
+from .targets import Aircraft as Aircraft
+from .targets import ConstantVelocity as ConstantVelocity
+from .targets import PathTarget as PathTarget
+from .targets import StaticTarget as StaticTarget
+from .targets import Target as Target
+from .targets import TurningTarget as TurningTarget
+from .targets import target_from_function as target_from_function
+from .tasks import Task as Task
+
+__version__: str
