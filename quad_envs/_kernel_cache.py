@@ -11,100 +11,35 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-import pickle
-import platform
 import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numba
 import numpy as np
-from numba.core import compiler, config, serialize, types
+from numba.core import config, types
 
-for _owner, _needed in ((compiler.CompileResult, "_rebuild"), (compiler.CompileResult, "_reduce")):
-    if not hasattr(_owner, _needed):
-        raise ImportError(f"this version of numba has no {_owner.__name__}.{_needed}")
+from ._kernel_digest import digest
+from ._kernel_file import pack, unpack
 
 PACKAGES = ("quad_envs", "controllers", "baselines")
-_FOREIGN = {*sys.stdlib_module_names, "numba", "numpy", "scipy"}  # their versions stand for their code
-_HEADER = hashlib.sha256().digest_size  # bytes before the pickle: its checksum
+_HEADER = hashlib.sha256().digest_size  # bytes before the kernel: its checksum
 _OUTDATED = 7 * 86400.0  # s, after which another version of the same kernel is swept
-_PLAIN = (int, float, complex, str, bytes, bool, type(None), type(Ellipsis), np.generic)
 
 
-def digest(function: Callable[..., Any]) -> str:
-    """Hex digest of a function and of everything of ours that its code can reach.
-
-    Line numbers, comments and docstrings do not count. Call it when the modules are complete: kernels may
-    use names that are defined below them.
-    """
-    met: dict[str, str] = {}
-    waiting = [function]
-    while waiting:
-        here = waiting.pop()
-        name = f"{here.__module__}.{here.__qualname__}"
-        if name not in met:
-            met[name] = "".join(_describe_code(here.__code__, here.__doc__))
-            for what, value in _reached(here):
-                met[f"{name}: {what}"] = _describe(value, waiting)
-    return hashlib.sha256(repr(sorted(met.items())).encode()).hexdigest()
+def _versions() -> tuple[str, ...]:
+    """Of what compiled kernels hold parts of."""
+    return numba.__version__, np.__version__, str(sys.implementation.cache_tag)
 
 
-def _root(module: str) -> str:
-    """The package of a module."""
-    return module.partition(".")[0]
-
-
-def _describe_code(code: CodeType, docstring: str | None = None) -> Iterator[str]:
-    """What makes a code object behave as it does."""
-    yield repr((code.co_code, code.co_names, code.co_varnames, code.co_freevars, code.co_flags))
-    for constant in code.co_consts:
-        if isinstance(constant, CodeType):
-            yield from _describe_code(constant)
-        elif constant != docstring:
-            yield repr(sorted(constant, key=repr) if isinstance(constant, frozenset) else constant)
-
-
-def _names(code: CodeType) -> set[str]:
-    """Names that a code object reads from its module or from other objects."""
-    inner = (constant for constant in code.co_consts if isinstance(constant, CodeType))
-    return set(code.co_names).union(*map(_names, inner))
-
-
-def _reached(function: Callable[..., Any]) -> Iterator[tuple[str, Any]]:
-    """What the code of a function can reach: globals, attributes of our modules, closure, defaults."""
-    assert isinstance(function, FunctionType)
-    names = _names(function.__code__)
-    for name in sorted(names & function.__globals__.keys()):
-        value = function.__globals__[name]
-        yield name, value
-        if isinstance(value, ModuleType) and _root(value.__name__) in PACKAGES:
-            yield from ((f"{name}.{part}", vars(value)[part]) for part in sorted(names & vars(value).keys()))
-    yield "defaults", function.__defaults__
-    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
-        yield name, cell.cell_contents
-
-
-def _describe(value: Any, waiting: list[Any]) -> str:
-    """One reached value as text; functions are named here and wait to be described."""
-    function = getattr(value, "py_func", None) or getattr(value, "_defn", value)  # of kernels, of intrinsics
-    if isinstance(function, FunctionType):
-        if _root(function.__module__) not in _FOREIGN:
-            waiting.append(function)
-        return f"{function.__module__}.{function.__qualname__}"
-    if isinstance(value, type):
-        return f"{value.__module__}.{value.__qualname__}{getattr(value, '_fields', '')}"
-    if isinstance(value, np.ndarray):
-        return repr((value.dtype.str, value.shape, value.tobytes()))
-    if isinstance(value, tuple | list | dict | slice) or isinstance(value, _PLAIN):
-        return repr(value)
-    return str(getattr(value, "__qualname__", getattr(value, "__name__", type(value).__qualname__)))
+def _settings() -> list[str]:
+    """What settings of numba change in compiled kernels."""
+    return [str(getattr(config, name, None)) for name in ("OPT", "BOUNDSCHECK")]
 
 
 def _describe_signature(signature: tuple[types.Type, ...]) -> str:
@@ -173,8 +108,8 @@ def _is_ours(place: Path) -> bool:
 class KernelCache:
     """What numba's dispatcher asks to load and to save the compiled forms of one kernel."""
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self._function = function
+    def __init__(self, kernel: Any) -> None:
+        function, self._kernel = kernel.py_func, kernel
         self._name = f"{function.__module__}.{function.__qualname__}".replace("<locals>", "locals")
         self._digest: str | None = None  # made at the first use, when all modules are complete
 
@@ -186,7 +121,6 @@ class KernelCache:
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """The compiled form for these argument types; None if there is none that can be read."""
-        target.refresh()
         name = self._file_name(signature, target.codegen())
         for place in folders():
             with contextlib.suppress(FileNotFoundError):
@@ -198,10 +132,10 @@ class KernelCache:
     def save_overload(self, signature: Any, compiled: Any) -> None:
         """Keep a compiled form; where that cannot be done, the next process compiles again."""
         place = folder()
-        if place is None or compiled.library.has_dynamic_globals or compiled.lifted:
+        if place is None or compiled.library.has_dynamic_globals or compiled.lifted or compiled.reload_init:
             return
         with contextlib.suppress(OSError):
-            raw = serialize.dumps(compiled._reduce())
+            raw = pack(compiled)
             path = place / self._file_name(signature, compiled.codegen)
             unfinished = place / f"{path.stem}.{os.getpid()}.tmp"
             unfinished.write_bytes(hashlib.sha256(raw).digest() + raw)
@@ -210,9 +144,9 @@ class KernelCache:
 
     def _file_name(self, signature: Any, codegen: Any) -> str:
         if self._digest is None:
-            self._digest = digest(self._function)[:16]
-        machine = (numba.__version__, platform.python_version(), codegen.magic_tuple())
-        key = hashlib.sha256(repr((_describe_signature(signature), machine)).encode()).hexdigest()[:16]
+            self._digest = digest(self._kernel)[:16]
+        made_for = (_describe_signature(signature), _versions(), _settings(), codegen.magic_tuple())
+        key = hashlib.sha256(repr(made_for).encode()).hexdigest()[:16]
         return f"{self._name}-{self._digest}-{key}.nbc"
 
     def _sweep(self, place: Path) -> None:
@@ -244,7 +178,7 @@ def _read(path: Path, target: Any) -> Any:
         raw = path.read_bytes()
         if hashlib.sha256(raw[_HEADER:]).digest() != raw[:_HEADER]:
             raise ValueError("cut or changed")
-        return compiler.CompileResult._rebuild(target, *pickle.loads(raw[_HEADER:]))
+        return unpack(raw[_HEADER:], target)
     except FileNotFoundError:
         raise
     except Exception:  # whatever is wrong with it, compiling is the remedy

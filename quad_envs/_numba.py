@@ -42,7 +42,7 @@ def _compile(function: Function, inline: bool) -> Function:
     if NestedKernel is None:
         return cast(Function, numba.njit(forceinline=inline, **options)(function))
     entry = cast(Any, numba.njit(**options)(function))
-    entry._cache = KernelCache(function)
+    entry._cache = KernelCache(entry)
     return cast(Function, NestedKernel(function, entry, inline))
 
 

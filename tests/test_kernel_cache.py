@@ -9,13 +9,18 @@ import warnings
 from pathlib import Path
 from types import ModuleType
 
+import numba
 import numpy as np
 import pytest
+from numba import float32, float64, njit
+from numba.core import config
+from numba.core.registry import cpu_target
 
 from quad_envs import _kernel_cache as cache
 from quad_envs._numba import kernel
 
 SOURCE = """
+from enum import IntEnum
 from typing import NamedTuple
 GAIN = 3.0
 TABLE = np.array([1.0, 2.0])
@@ -24,13 +29,32 @@ class Pair(NamedTuple):
     first: float
     second: float
 
+class Place(IntEnum):
+    START = 0
+
+def deepest(x, gain=1.0, *, offset=0.0):
+    return gain * x + offset + DEEP[1][0]
+
+def deeper(x):
+    return deepest(x)
+
 def inner(x):
     "A docstring."
-    return GAIN * x
+    return GAIN * deeper(x)
 
 def outer(x):
-    pair = Pair(x, TABLE[0])
-    return inner(pair.first) + pair.second
+    pair = Pair(x, TABLE[Place.START])
+    return inner(pair.first) + pair.second + sum(make(g)(x) for g in (1, 2))
+
+def make(gain):
+    return lambda x: gain * x
+
+triple, double = make(3.0), make(2.0)
+
+def both(x):
+    return triple(x) + double(x)
+
+DEEP = (1.0, np.array([5.0]))
 """
 
 
@@ -51,7 +75,12 @@ def test_comments_docstrings_and_lines_leave_a_compiled_kernel_valid(old, new):
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        ("return GAIN * x", "return GAIN + x"),
+        ("return GAIN * deeper(x)", "return GAIN + deeper(x)"),
+        ("gain * x + offset", "gain * x - offset"),
+        ("gain=1.0", "gain=2.0"),
+        ("offset=0.0", "offset=1.0"),
+        ("np.array([5.0])", "np.array([6.0])"),
+        ("START = 0", "START = 1"),
         ("GAIN = 3.0", "GAIN = 4.0"),
         ("1.0, 2.0", "1.0, 2.5"),
         ("    first: float\n    second: float", "    second: float\n    first: float"),
@@ -62,7 +91,7 @@ def test_whatever_a_kernel_reaches_voids_it_when_it_changes(old, new):
 
 
 def test_what_a_kernel_does_not_reach_leaves_it_valid():
-    assert digest_of(SOURCE.replace("TABLE[0]", "TABLE[1]"), "inner") == digest_of(SOURCE, "inner")
+    assert digest_of(SOURCE.replace("+ pair.second", "- pair.second"), "inner") == digest_of(SOURCE, "inner")
 
 
 def test_a_constant_read_through_a_module_and_one_in_a_closure_count():
@@ -75,6 +104,59 @@ def test_a_constant_read_through_a_module_and_one_in_a_closure_count():
 
     assert make(2.0, 3.0) == make(2.0, 3.0)
     assert len({make(2.0, 3.0), make(2.5, 3.0), make(2.0, 3.5)}) == 3
+
+
+def test_kernels_of_one_factory_are_told_apart():
+    assert digest_of(SOURCE.replace("make(2.0)", "make(4.0)"), "both") != digest_of(SOURCE, "both")
+    swapped = SOURCE.replace("make(3.0), make(2.0)", "make(2.0), make(3.0)")
+    assert digest_of(swapped, "both") != digest_of(SOURCE, "both")
+
+
+def test_a_constant_read_through_two_modules_counts():
+    def of(gain):
+        outer, inner = ModuleType("quad_envs.outer"), ModuleType("quad_envs.inner")
+        outer.inner, inner.GAIN, inner.outer = inner, gain, outer
+        module = {"__name__": "made_up", "outer": outer}
+        exec("def read(x):\n    return outer.inner.GAIN * x", module)
+        return cache.digest(module["read"])
+
+    assert of(2.0) == of(2.0) != of(3.0)
+
+
+def test_options_of_compilation_count_at_every_depth():
+    def of(**options):
+        module = {"__name__": "made_up", "inner": njit(**options)(lambda x: 2.0 * x)}
+        exec("def outer(x):\n    return inner(x)", module)
+        return cache.digest(module["outer"]), cache.digest(module["inner"])
+
+    for once, again, other in zip(of(), of(), of(fastmath={"contract"}), strict=True):
+        assert once == again != other
+
+
+def identity(x):
+    return x
+
+
+def file_name(signature=(float64,)):
+    """Under which a kernel is kept."""
+    return cache.KernelCache(kernel(identity))._file_name(signature, cpu_target.target_context.codegen())
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "value"),
+    [
+        (numba, "__version__", "0.1"),
+        (np, "__version__", "1.0"),
+        (config, "OPT", 0),
+        (config, "BOUNDSCHECK", 1),
+        (type(cpu_target.target_context.codegen()), "magic_tuple", lambda codegen: ("another processor",)),
+    ],
+)
+def test_another_version_setting_or_processor_voids_a_kernel(monkeypatch, owner, name, value):
+    here = file_name()
+    assert here == file_name() != file_name((float32,))
+    monkeypatch.setattr(owner, name, value)
+    assert file_name() != here and file_name().split("-")[:2] == here.split("-")[:2]
 
 
 def fresh_kernel(folder, monkeypatch):
@@ -145,6 +227,73 @@ def test_old_versions_of_a_kernel_and_unfinished_files_are_swept_after_a_while(t
     assert recent.exists() and not old.exists() and not unfinished.exists()
 
 
+EVERYTHING = """
+import sys
+from typing import NamedTuple
+import numpy as np
+from quad_envs._numba import kernel
+
+class Pair(NamedTuple):
+    table: np.ndarray
+    total: float
+
+@kernel
+def inner(n, gain):
+    if n > 9:
+        raise ValueError("n must be at most 9")
+    table = np.arange(n) * gain
+    return table[::-1].copy()
+
+@kernel
+def outer(n, pair):
+    table = inner(n, pair.total)
+    return Pair(table + pair.table, np.sin(table).sum())
+
+@kernel
+def other(x):
+    return np.linalg.norm(x) + np.sort(x)[0]
+
+print(outer(3, Pair(np.ones(3), 2.0)))
+try:
+    outer(12, Pair(np.ones(12), 2.0))
+except ValueError as error:
+    print(error)
+print("compiler loaded:", "numba.np.arraymath" in sys.modules, "scipy.linalg" in sys.modules)
+if len(sys.argv) > 1:
+    print(other(np.ones(4)))
+"""
+
+
+def test_kernels_found_again_need_no_compiler_and_others_compile_beside_them(tmp_path):
+    script = tmp_path / "everything.py"
+    script.write_text(EVERYTHING)
+
+    def run(*arguments):
+        command = [sys.executable, str(script), *arguments]
+        environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+
+    cold, warm, mixed = run(), run(), run("more")
+    said = "Pair(table=array([5., 3., 1.]), total=0.1524949"
+    assert cold.startswith(said) and "n must be at most 9" in cold
+    assert "compiler loaded: True True" in cold
+    assert warm == cold.replace("True True", "False False")
+    assert mixed == warm + "3.0\n"
+
+
+def test_a_kernel_that_calls_what_is_not_there_is_compiled_anew(tmp_path, monkeypatch):
+    from quad_envs import _kernel_file
+
+    assert fresh_kernel(tmp_path, monkeypatch)(1.5) == 3.0
+    (file,) = tmp_path.iterdir()
+    packed = file.read_bytes()[cache._HEADER :]
+    with pytest.raises(ValueError, match="needs no_such_function"):
+        monkeypatch.setattr(_kernel_file, "_missing", lambda needed: ["no_such_function"])
+        _kernel_file.unpack(packed, cpu_target.target_context)
+    again = fresh_kernel(tmp_path, monkeypatch)
+    assert again(1.5) == 3.0 and sum(again.entry.stats.cache_misses.values()) == 1
+
+
 ONE_STEP = """
 import gymnasium as gym, numpy as np, quad_envs
 env = gym.make("quad/HelixTracking-v0")
@@ -155,7 +304,7 @@ print(float(reward).hex(), observation.tobytes().hex())
 
 
 @pytest.mark.slow  # compiles the environment's kernels in numba's plain way
-@pytest.mark.parametrize("module", ["quad_envs._nested", "quad_envs._kernel_cache"])
+@pytest.mark.parametrize("module", ["quad_envs._nested", "quad_envs._kernel_file"])
 def test_without_the_private_names_of_numba_a_step_is_the_same_and_one_warning_says_why(module):
     hide = f"import sys\nsys.modules[{module!r}] = None\n"
     run = [
