@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import RolloutBufferSamples
 
-from .tanh import fast_tanh
+from .tanh import fast_tanh_
 
 
 class Tanh(torch.nn.Module):
@@ -18,7 +18,7 @@ class Tanh(torch.nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Apply it."""
-        return fast_tanh(x)
+        return fast_tanh_(x)
 
 
 class RowBuffer(RolloutBuffer):

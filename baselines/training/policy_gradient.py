@@ -46,12 +46,12 @@ class Actor:
 
     def __call__(self, x: Any) -> Any:
         """Outputs for scaled features (n, inputs), (n, outputs)."""
-        from .tanh import fast_tanh
+        from .tanh import fast_tanh_
 
         for layer in self.layers[:-1]:
-            x = fast_tanh(layer(x))
+            x = fast_tanh_(layer(x))
         x = self.layers[-1](x)
-        return fast_tanh(x) if self.squash == "tanh" else x
+        return fast_tanh_(x) if self.squash == "tanh" else x
 
     def load(self, network: Network, features: Features) -> None:
         """Take over the weights of a network.
