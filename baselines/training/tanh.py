@@ -1,4 +1,4 @@
-"""The hyperbolic tangent in float32 on the CPU, compiled: a rational function, which a core computes in lanes.
+"""The hyperbolic tangent in float32 on the CPU, compiled: a rational function that a core computes in lanes.
 
 On [-7.9, 7.9] tanh(x) is x p(x^2) / q(x^2) to 4e-7 with p of degree 6 and q of degree 3, the function that
 Eigen has for networks; beyond, tanh is 1 in float32. It takes 0.3 to 0.5 ns an element on every processor
