@@ -122,6 +122,17 @@ def test_nothing_is_recorded_and_pillow_stays_away_without_a_render_mode():
     assert done.stdout.split() == ["False", "True", "False"]
 
 
+def test_one_vehicle_without_pictures_loads_neither_pictures_nor_teams():
+    code = (
+        "import sys, gymnasium as gym, quad_envs\n"
+        "env = gym.make('quad/HelixTracking-v0'); gym.make_vec('quad/HelixTracking-v0', num_envs=2)\n"
+        "print([name for name in sys.modules if name.startswith(('quad_envs.pict', 'quad_envs.envs.pict', "
+        "'quad_envs.envs.team', 'scipy.linalg'))])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
 def test_up_in_the_world_is_up_on_the_screen():
     low, high = project([[2.0, 1.0, -1.0], [2.0, 1.0, -2.0]])
     assert high[1] > low[1]

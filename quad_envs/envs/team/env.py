@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from gymnasium import logger, spaces
@@ -15,7 +15,7 @@ from ...names import shown
 from ...observations.tracking import N_REFERENCE
 from ...parameters import Array
 from ...tasks import TeamTask
-from ..pictures import NO_RENDERING, TeamPictures, checked_rendering
+from ..shared.render_modes import NO_RENDERING, checked_rendering
 from ..tracking.kernel import (
     CAUSE,
     CLIPPED,
@@ -34,6 +34,9 @@ from .batch import TeamBatch
 from .exchange import ALIVE, HEARD, NEAREST, SLOT_ERROR, TERMINATED, TERMS
 from .options import TeamOptions
 from .scores import N_LOSS
+
+if TYPE_CHECKING:
+    from ..pictures import TeamPictures
 
 Observation = NDArray[np.float32]
 Named = dict[str, Any]
@@ -65,7 +68,11 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
         self.render_mode = render_mode
         options = self.options_type.from_kwargs(kwargs)
         self._batch = TeamBatch(options, 1)
-        self._pictures = TeamPictures(self._batch, picture_size, render_mode) if render_mode else None
+        self._pictures: TeamPictures | None = None
+        if render_mode:
+            from ..pictures import TeamPictures  # not needed by who trains and measures
+
+            self._pictures = TeamPictures(self._batch, picture_size, render_mode)
         self.possible_agents = [f"quad_{i}" for i in range(options.vehicles)]
         self.agents: list[str] = []
         self.max_cycles = self.task.episode_steps

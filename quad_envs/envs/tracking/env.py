@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -13,11 +13,14 @@ from ...episode_limit import steps_asked
 from ...observations.tracking import N_REFERENCE
 from ...parameters import Array
 from ...tasks import Task
-from ..pictures import NO_RENDERING, RenderModes, TrackingPictures, checked_rendering
+from ..shared.render_modes import NO_RENDERING, RenderModes, checked_rendering
 from ..shared.specified import Specified
 from .batch import TrackingBatch
 from .kernel import CAUSE, PLANT, SCORES, VALUES
 from .options import TrackingOptions
+
+if TYPE_CHECKING:
+    from ..pictures import TrackingPictures
 
 Observation = NDArray[np.float32]
 
@@ -99,7 +102,11 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
             kwargs["max_episode_steps"] = asked
         self.render_mode = render_mode
         self._batch = TrackingBatch(TrackingOptions.from_kwargs(kwargs), 1)
-        self._pictures = TrackingPictures(self._batch, 0, size) if render_mode else None
+        self._pictures: TrackingPictures | None = None
+        if render_mode:
+            from ..pictures import TrackingPictures  # not needed by who trains and measures
+
+            self._pictures = TrackingPictures(self._batch, 0, size)
         self._bind()
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.observation_space = spaces.Box(-np.inf, np.inf, (self._size,), np.float32)

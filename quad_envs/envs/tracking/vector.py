@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -16,13 +16,16 @@ from ...checks import require_whole
 from ...observations.tracking import N_REFERENCE
 from ...parameters import Array
 from ...tasks import Task
-from ..pictures import NO_RENDERING, TrackingPictures, checked_rendering
 from ..shared.given import as_numbers
+from ..shared.render_modes import NO_RENDERING, checked_rendering
 from ..shared.specified import Specified
 from ..shared.vector_parts import Generators, score_infos, seeded, with_presence
 from .batch import TrackingBatch
 from .kernel import CRASHED, PLANT, REWARD, TRUNCATED
 from .options import TrackingOptions
+
+if TYPE_CHECKING:
+    from ..pictures import TrackingPictures
 
 Observations = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -65,8 +68,11 @@ class TrackingVectorEnv(
             "autoreset_mode": self.autoreset_mode,
         }
         self._batch = TrackingBatch(options, num_envs)
-        shown = range(num_envs) if render_mode else range(0)
-        self._pictures = [TrackingPictures(self._batch, i, size) for i in shown]
+        self._pictures: list[TrackingPictures] = []
+        if render_mode:
+            from ..pictures import TrackingPictures  # not needed by who trains and measures
+
+            self._pictures = [TrackingPictures(self._batch, i, size) for i in range(num_envs)]
         self._n_values = len(self.task.constraint_names)
         self.single_action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (self.task.layout.size,), np.float32)
