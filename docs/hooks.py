@@ -2,8 +2,8 @@
 
 Equations become MathML when the site is built: `pymdownx.arithmatex` has marked them, their TeX escaped as
 HTML. The one script that the theme would take from the network is the copy in docs/vendor. And tables of what
-the code knows are written from it: the columns of tables, the hyperparameters of the learners, the
-options of the controllers.
+the code knows are written from it: the columns of tables, the limits, the hyperparameters of the learners,
+the options of the controllers.
 """
 
 from __future__ import annotations
@@ -48,6 +48,18 @@ def episode_table() -> str:
     return "\n".join(lines)
 
 
+def limits_table() -> str:
+    """The limits that environments take, as Markdown."""
+    from quad_envs.limits import LIMITS
+
+    lines = ["| argument | limits | violation that costs the whole reward of a step |", "|---|---|---|"]
+    for limit in LIMITS:
+        form = ": ((x, y, z) lower, (x, y, z) upper)" if limit.box else ""
+        scale = f"{limit.scale:g} {limit.unit}" if limit.scale else "the largest permitted one of a step"
+        lines.append(f"| `{limit.option}` | {limit.about}{form}, {limit.given_unit} | {scale} |")
+    return "\n".join(lines)
+
+
 def hyperparameter_tables() -> str:
     """What each learner lets choose, in Markdown, from the comments in its options."""
     from baselines.training.algorithms import ALGORITHMS
@@ -87,6 +99,7 @@ def _rows(what: str, values: dict[str, Any], comments: dict[str, str]) -> list[s
 _TABLES = {
     "<!-- table: columns -->": columns_table,
     "<!-- table: episode -->": episode_table,
+    "<!-- table: limits -->": limits_table,
     "<!-- table: hyperparameters -->": hyperparameter_tables,
     "<!-- table: controller options -->": controller_options_table,
 }

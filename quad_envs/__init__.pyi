@@ -13,7 +13,7 @@ from .graphs import Timed as Timed
 from .graphs import adjacency as adjacency
 from .graphs import make_graph as make_graph
 from .graphs import toward_leader as toward_leader
-from .parameters import Limits as Limits
+from .limits import Limits as Limits
 from .parameters import QuadrotorParams as QuadrotorParams
 from .parameters import Weights as Weights
 from .references import Heading as Heading

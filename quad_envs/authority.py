@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from .parameters import Array, Limits, QuadrotorParams
+from .limits import Limits
+from .parameters import Array, QuadrotorParams
 
 
 def hover_authority(params: QuadrotorParams, limits: Limits) -> Array:

@@ -2,32 +2,19 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ._numba import inline_kernel, kernel
-from .parameters import N_INPUT, Array, Limits
+from .limits import Limits
+from .plant import N_INPUT, N_STATE, Array
 
 TOLERANCE = 1e-3  # SI: 1 mm, 1 mm/s, 1 mrad, 1 mN; below what a model without rotor lag can promise
-
-# A violation that large costs the whole reward of a step.
-TILT_SCALE = 0.1  # rad
-VELOCITY_SCALE = 0.5  # m/s
-POSITION_SCALE = 0.1  # m
-# for the command rate it is the largest permitted change itself
 
 
 def constraint_names(limits: Limits) -> tuple[str, ...]:
     """Names of the constraint rows that these limits make, in the order of `constraint_values`."""
-    rows = (
-        ("tilt", math.isfinite(limits.tilt)),
-        ("velocity", math.isfinite(limits.velocity)),
-        ("position", limits.has_position),
-        ("rate", math.isfinite(limits.rate)),
-    )
-    return tuple(name for name, present in rows if present)
+    return tuple(limit.name for limit in limits.chosen())
 
 
 def constraint_values(
@@ -45,29 +32,18 @@ def constraint_values(
     Returns:
         (..., number of rows).
     """
-    x = np.asarray(plant, dtype=np.float64)
-    p, V_B, tilt = x[..., 0:3], x[..., 3:6], x[..., 6:8]
-    outside = np.maximum(np.asarray(limits.position_lower) - p, p - np.asarray(limits.position_upper))
-    change = np.abs(np.asarray(command, dtype=np.float64) - np.asarray(previous, dtype=np.float64))
-    value = {
-        "tilt": np.abs(tilt).max(axis=-1) - limits.tilt,
-        "velocity": np.abs(V_B).max(axis=-1) - limits.velocity,
-        "position": outside.max(axis=-1),
-        "rate": change.max(axis=-1) - limits.rate * dt,
-    }
-    rows = [np.broadcast_to(value[name], x.shape[:-1]) for name in constraint_names(limits)]
+    x = np.asarray(plant, dtype=np.float64)[..., :N_STATE]
+    change = np.asarray(command, dtype=np.float64) - np.asarray(previous, dtype=np.float64)
+    y = np.concatenate([x, np.broadcast_to(change, (*x.shape[:-1], N_INPUT))], axis=-1)
+    lower, upper = limits.output_box(dt)
+    outside = np.maximum(lower - y, y - upper)
+    rows = [outside[..., limit.outputs].max(axis=-1) for limit in limits.chosen()]
     return np.stack(rows, axis=-1) if rows else np.zeros((*x.shape[:-1], 0))
 
 
 def constraint_scales(limits: Limits, dt: float) -> Array:
     """Violation of each row that costs the whole reward of a step, (number of rows,)."""
-    scale = {
-        "tilt": TILT_SCALE,
-        "velocity": VELOCITY_SCALE,
-        "position": POSITION_SCALE,
-        "rate": limits.rate * dt,
-    }
-    return np.array([scale[name] for name in constraint_names(limits)])
+    return np.array([limits.scale(limit, dt) for limit in limits.chosen()])
 
 
 @inline_kernel

@@ -16,8 +16,9 @@ from numpy.typing import ArrayLike
 
 from .authority import hover_authority
 from .kinds import as_tuple, is_number, make_kind, refuse_class, without_booleans
+from .limits import Limits
 from .names import shown, unknown_name
-from .parameters import Array, Limits, QuadrotorParams
+from .parameters import Array, QuadrotorParams
 
 _Vector = tuple[float, float, float]
 _ZERO: _Vector = (0.0, 0.0, 0.0)

@@ -6,21 +6,19 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .checks import Bound, require_number
-from .kinds import is_limit, is_number
+from .kinds import is_number
+from .limits import Limits as Limits
 from .names import shown
-
-Array = NDArray[np.float64]
-
-N_STATE = 12  # [p, V_B, Theta, Omega]
-N_INPUT = 4  # rotor forces
-POSITION = slice(0, 3)
-VELOCITY = slice(3, 6)  # body axes
-ATTITUDE = slice(6, 9)  # roll, pitch, yaw
-RATES = slice(9, 12)
-FORCES = slice(12, 16)  # rotor forces, appended to the state in plant rows
+from .plant import ATTITUDE as ATTITUDE
+from .plant import FORCES as FORCES
+from .plant import N_INPUT as N_INPUT
+from .plant import N_STATE as N_STATE
+from .plant import POSITION as POSITION
+from .plant import RATES as RATES
+from .plant import VELOCITY as VELOCITY
+from .plant import Array as Array
 
 # Entries of QuadrotorParams.coefficients(), the form in which compiled kernels read a vehicle.
 (
@@ -44,7 +42,6 @@ FORCES = slice(12, 16)  # rotor forces, appended to the state in plant rows
 N_COEFFICIENTS = 16
 N_MOTION_COEFFICIENTS = 14  # the first ones, of the rigid body
 FRAMES = {"plus": 0.0, "x": math.pi / 4.0}  # delta, rad: from the x axis to the arm of rotor 1
-MOST_KAPPA = 20.0  # thrust-to-weight 80, beyond any vehicle; the dissertation has 1
 
 
 _FLYING = "no multicopter, from the smallest robot insects to air taxis on any planet, is beyond"
@@ -59,7 +56,6 @@ _BOUNDS = {
 }
 _MOMENT = Bound(1e-12, 1e6, "kg m^2", _FLYING)
 _ROUNDING = 1e-9  # relative, of principal moments that are given as decimals
-LEAST_LIMIT = 1e-6  # SI; below, the relative size of a violation means nothing
 MOST_WEIGHT = 1e15  # of Q and R; beyond, the cost of a flight leaves the numbers
 _LEAST_WEIGHT = 1e-15  # of R
 
@@ -176,67 +172,6 @@ class QuadrotorParams:
                 self.hover_force,
             ]
         )
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """What a flight may not exceed. Infinity means no limit.
-
-    The rotor box is physical: the plant saturates. The others are constraints, Eqs. (3.10) and (3.11):
-    exceeding them is counted, costs reward, and is what an MPC plans around.
-
-    Raises:
-        ValueError: If kappa leaves no hover, a limit is not positive, or the position box is empty.
-    """
-
-    # -, largest rotor force as a fraction of the weight, Eq. (2.39): one number, or one per rotor
-    kappa: float | tuple[float, ...] = 1.0
-    rate: float = math.inf  # N/s, change of each rotor command
-    tilt: float = math.inf  # rad, |roll| and |pitch|
-    velocity: float = math.inf  # m/s, each body velocity component
-    position_lower: tuple[float, float, float] = (-math.inf, -math.inf, -math.inf)  # m, NED
-    position_upper: tuple[float, float, float] = (math.inf, math.inf, math.inf)  # m, NED
-
-    def __post_init__(self) -> None:
-        if len(self.kappas) != N_INPUT:
-            raise ValueError(f"kappa must be one number or one per rotor, got {shown(self.kappa)}")
-        for i, kappa in enumerate(self.kappas):
-            if not (is_number(kappa) and 0.25 < kappa <= MOST_KAPPA):
-                which = f" for rotor {i + 1}" if isinstance(self.kappa, tuple) else ""
-                raise ValueError(
-                    "kappa, the largest rotor force as a fraction of the weight, must lie in "
-                    f"(1/4, {MOST_KAPPA:g}], got {shown(kappa)}{which}; hover needs m g / 4 of every rotor. "
-                    "It is a quarter of the thrust-to-weight ratio; 0.3125 gives the dissertation's 2.45 N"
-                )
-        for name, unit in (("rate", "N/s"), ("tilt", "rad"), ("velocity", "m/s")):
-            value = getattr(self, name)
-            if not (is_limit(value) and value > 0.0):
-                raise ValueError(f"{name} limit must be > 0 {unit} (math.inf for none), got {shown(value)}")
-            if value < LEAST_LIMIT:
-                raise ValueError(
-                    f"{name} limit must be at least {LEAST_LIMIT:g} {unit}, so that a violation can be told "
-                    f"from rounding, got {shown(value)}"
-                )
-        if math.isfinite(self.tilt) and self.tilt >= math.pi / 2:
-            raise ValueError(f"tilt limit must be below pi/2 rad (math.inf for none), got {shown(self.tilt)}")
-        if len(self.position_lower) != 3 or len(self.position_upper) != 3:
-            raise ValueError("position limits need three numbers (x, y, z), m")
-        for axis, low, high in zip("xyz", self.position_lower, self.position_upper, strict=True):
-            if not (is_limit(low) and is_limit(high) and low < high):
-                raise ValueError(
-                    f"position limit on {axis} needs numbers lower < upper, got [{shown(low)}, "
-                    f"{shown(high)}] m"
-                )
-
-    @property
-    def kappas(self) -> tuple[float, ...]:
-        """The largest force of each rotor as a fraction of the weight, (4,)."""
-        return self.kappa if isinstance(self.kappa, tuple) else (self.kappa,) * N_INPUT
-
-    @property
-    def has_position(self) -> bool:
-        """Whether any face of the position box is finite."""
-        return any(math.isfinite(value) for value in (*self.position_lower, *self.position_upper))
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .constraints import constraint_names
+from .limits import Limits
 from .observations.team import AgentLayout
 from .observations.tracking import TrackingLayout
-from .parameters import Array, Limits, QuadrotorParams, Weights
+from .parameters import Array, QuadrotorParams, Weights
 
 _Triple = tuple[float, float, float]
 LOSS_PARTS = ("position", "velocity", "attitude", "rates", "effort", "formation")  # of the stage cost

@@ -12,6 +12,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Annotated, Any, NamedTuple, get_type_hints
 
+from quad_envs.limits import UNITS
+
 from .column import (
     COMPARED,
     COUNTED,
@@ -189,7 +191,6 @@ def _columns() -> Iterator[Column]:
             yield from (named, named.worst()) if named.has(WORST) else (named,)
 
 
-_LIMIT_UNITS = {"tilt": "rad", "velocity": "m/s", "position": "m", "rate": "N", "separation": "m"}
 COLUMNS = {column.name: column for column in _columns()}
 _OF_TEAMS = frozenset(name for name, column in COLUMNS.items() if column.has(TEAM))
 
@@ -221,7 +222,7 @@ def shown(team: bool, limits: Iterable[str]) -> list[Column]:
 def _limit_column(limit: str) -> Column:
     about = f"largest excess over the limit on {limit}, all flights"
     words = f"Worst {limit.replace('_', ' ')}"
-    return Column(words, _LIMIT_UNITS.get(limit, ""), about, LESS, words.lower(), f"worst_{limit}")
+    return Column(words, UNITS.get(limit, ""), about, LESS, words.lower(), f"worst_{limit}")
 
 
 def limits_in(row: Mapping[str, Any]) -> list[str]:

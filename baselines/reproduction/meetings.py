@@ -14,8 +14,9 @@ import numpy as np
 from controllers.team.cooperative import CooperativeMpc
 from quad_envs.dynamics import simulate
 from quad_envs.formations import start_positions
+from quad_envs.limits import Limits
 from quad_envs.observations.team import AgentLayout
-from quad_envs.parameters import Array, Limits
+from quad_envs.parameters import Array
 from quad_envs.rotations import rotation_body_from_inertial
 from quad_envs.tasks import TeamTask
 

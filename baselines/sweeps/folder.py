@@ -18,6 +18,7 @@ from baselines.sweeps.comparison import Results
 from baselines.sweeps.suite import EnvChoice, Suite
 from baselines.sweeps.units import Unit, suite_units
 from quad_envs.constraints import TOLERANCE
+from quad_envs.limits import UNITS
 from quad_envs.tasks import BaseTask
 
 
@@ -68,6 +69,7 @@ def task_facts(task: BaseTask) -> dict[str, Any]:
     facts = {key: value for key, value in asdict(task).items() if key != "layout"}
     derived = {
         "constraint_names": task.constraint_names,
+        "constraint_units": [UNITS[name] for name in task.constraint_names],
         "force_max": task.force_max.tolist(),
         "hover_force": task.hover_force,
         "rotors": (task.params.rotor_positions() / task.params.arm).tolist(),

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, RATES, VELOCITY, Array, Limits
+from quad_envs.limits import Limits
+from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, RATES, Array
 from quad_envs.tasks import BaseTask, Task
 
 from ..controller import Decision, as_one_row, as_rows, first_non_finite, raise_non_finite
@@ -54,13 +55,10 @@ class Problem(NamedTuple):
 def limit_rows(limits: Limits, margin: float, weight: float, horizon: int) -> tuple[StateRows, IntArray]:
     """State rows of the limits, less a margin, at stages 1..N; the position axis of each output (-1: none).
 
-    Outputs: body velocity components, roll and pitch, coordinates of the position, in this order.
+    Outputs: the bounded entries of the state, those of the position last.
     """
-    lower, upper = np.full(N_STATE, -math.inf), np.full(N_STATE, math.inf)
-    lower[VELOCITY], upper[VELOCITY] = -limits.velocity, limits.velocity
-    lower[ATTITUDE][:2], upper[ATTITUDE][:2] = -limits.tilt, limits.tilt
-    lower[POSITION], upper[POSITION] = limits.position_lower, limits.position_upper
-    order = np.r_[VELOCITY, ATTITUDE, POSITION]
+    lower, upper = limits.state_box()
+    order = np.r_[POSITION.stop : N_STATE, POSITION]
     outputs = order[np.isfinite(lower[order]) | np.isfinite(upper[order])]
     lower, upper = lower + margin, upper - margin
     if (lower > upper).any():
@@ -74,10 +72,10 @@ def limit_rows(limits: Limits, margin: float, weight: float, horizon: int) -> tu
 def plan_bound(options: MpcOptions, task: BaseTask) -> Array:
     """Largest magnitude of each state of a plan where its model holds, (12,); inf for none of its own."""
     bound = np.full(N_STATE, math.inf)
-    if options.largest_tilt() < task.limits.tilt:
-        bound[ATTITUDE][:2] = options.largest_tilt()
+    bound[ATTITUDE][:2] = options.largest_tilt()
     bound[RATES] = options.largest_rate(task.dt) * np.array([1.0, 1.0, YAW_SHARE])
-    return bound
+    lower, upper = task.limits.state_box()
+    return np.where((bound < upper) | (bound < -lower), bound, math.inf)
 
 
 def plan_rows(bound: Array, horizon: int) -> StateRows:

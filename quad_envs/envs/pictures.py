@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..constraints import TOLERANCE
+from ..limits import UNITS
 from ..parameters import POSITION, VELOCITY, Array
 from ..pictures.scenes import Framing, Scene
 from ..pictures.window import Window
@@ -24,7 +25,6 @@ from .tracking.batch import TrackingBatch
 from .tracking.kernel import CRASHED, PLANT, REWARD, STEP, TRUNCATED, VALUES, VIOLATED
 
 _TRAIL = 3.0  # s
-_UNITS = {"tilt": "rad", "velocity": "m/s", "position": "m", "rate": "N", "separation": "m"}
 _OVERVIEW_POINTS = 120
 
 
@@ -284,5 +284,5 @@ def _limit_texts(names: tuple[str, ...], values: Array) -> tuple[tuple[str, bool
     for name, column in zip(names, values.T, strict=True):
         over = column[column > TOLERANCE]
         many = f" ({over.size})" if len(values) > 1 else ""
-        texts.append((f"{name} +{over.max():.2f} {_UNITS[name]}{many}" if over.size else name, over.size > 0))
+        texts.append((f"{name} +{over.max():.2f} {UNITS[name]}{many}" if over.size else name, over.size > 0))
     return tuple(texts)

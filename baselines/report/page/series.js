@@ -4,7 +4,6 @@ const DEGREES = 180 / Math.PI;
 const NEES_BAND = [0.2158, 9.3484]; // 95 % of chi-square with 3 degrees of freedom
 const SOLID = [];
 const DASHES = [SOLID, [6, 3], [2, 3], [8, 3, 2, 3]];
-const CONSTRAINT_UNITS = { tilt: "rad", velocity: "m/s", position: "m", rate: "N", separation: "m" };
 
 /** shown: [{ flight, label, colourOf(vehicle) }]; focus: number of a vehicle, or null for all. */
 function plotsOf(shown, environment, focus) {
@@ -121,8 +120,8 @@ function attitudePlot(context) {
 
 function constraintPlot(context, name, index) {
   const groups = groupsOf(context, "constraints", (table) => [{ values: table[index], dash: SOLID }]);
-  const unit = `${CONSTRAINT_UNITS[name] ?? "SI"}, value minus limit; above 0 is violated`;
-  return { title: `Limit: ${name}`, unit, groups, limits: [{ value: 0, text: "limit" }], above: 0 };
+  const unit = `${context.task.constraint_units?.[index] ?? "SI"}, value minus limit; above 0 is violated`;
+  return { title: `Limit: ${name.replaceAll("_", " ")}`, unit, groups, limits: [{ value: 0, text: "limit" }], above: 0 };
 }
 
 function decisionPlot(context) {

@@ -12,9 +12,10 @@ import numpy as np
 
 from ...checks import Bound, array_bytes, require_number, require_whole
 from ...disturbances import Disturbance, DisturbanceLike, beyond_authority, disturbance_of
-from ...kinds import as_tuple, is_limit, is_number
+from ...kinds import as_tuple, is_number
+from ...limits import LimitOptions
 from ...names import shown, suggestion
-from ...parameters import N_INPUT, N_STATE, Array, Limits, QuadrotorParams, Weights
+from ...parameters import N_STATE, Array, QuadrotorParams, Weights
 from ...references import Reference, in_episode, length_of, make_reference, mismatch
 from ...registration import DT, TIME_LIMIT
 from ...vehicles import vehicle_values
@@ -33,7 +34,7 @@ Options = TypeVar("Options", bound="VehicleOptions")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VehicleOptions:
+class VehicleOptions(LimitOptions):
     """The arguments that all environments share. `TrackingEnv` documents each."""
 
     kind: ClassVar[str] = ""  # of environment, for messages
@@ -48,11 +49,6 @@ class VehicleOptions:
     rotor_rate: float = 50.0
     drag: float = 0.0
     frame: str = "plus"
-    kappa: float | tuple[float, float, float, float] = 1.0
-    rate_limit: float = math.inf
-    tilt_limit: float = math.inf
-    velocity_limit: float = math.inf
-    position_limit: tuple[Triple, Triple] | None = None
     Q: float | tuple[float, ...] = 1.0
     R: float | tuple[float, ...] = 1.0
     disturbance: DisturbanceLike = None
@@ -77,20 +73,7 @@ class VehicleOptions:
             raise ValueError(
                 f"reveal_disturbance must be True or False, got {shown(self.reveal_disturbance)}"
             )
-        rotors = self.kappa if isinstance(self.kappa, tuple) else (self.kappa,) * N_INPUT
-        if len(rotors) != N_INPUT or not all(map(is_number, rotors)):
-            raise ValueError(
-                f"kappa must be a number or {N_INPUT} of them, one per rotor, got {shown(self.kappa)}"
-            )
-        if self.position_limit is not None and not (
-            isinstance(self.position_limit, tuple)
-            and len(self.position_limit) == 2
-            and all(map(_is_vector, self.position_limit))
-        ):
-            raise ValueError(
-                "position_limit must be None or ((x, y, z) lower, (x, y, z) upper), "
-                f"got {shown(self.position_limit)}"
-            )
+        self.require_limits()
         steps = self.episode_steps
         self.require_whole("substeps", 1, _MOST_SUBSTEPS, lambda n: array_bytes((steps, 2 * n + 1, 7)))
         if self.reward not in ("bounded", "quadratic"):
@@ -192,18 +175,6 @@ class VehicleOptions:
         """Control periods of an episode."""
         return round(self.time_limit / self.dt)
 
-    def make_limits(self) -> Limits:
-        """The limits that are set."""
-        lower, upper = self.position_limit or ((-math.inf,) * 3, (math.inf,) * 3)
-        return Limits(
-            kappa=self.kappa,
-            rate=self.rate_limit,
-            tilt=self.tilt_limit,
-            velocity=self.velocity_limit,
-            position_lower=lower,
-            position_upper=upper,
-        )
-
     def make_params(self) -> QuadrotorParams:
         """The nominal vehicle."""
         return QuadrotorParams(
@@ -290,11 +261,6 @@ def varied_params(params: QuadrotorParams, factors: Mapping[str, float | Array])
     largest = int(np.argmax(J))
     J[largest] = min(J[largest], J.sum() - J[largest])
     return replace(params, inertia=tuple(J.tolist()), **values)
-
-
-def _is_vector(value: object) -> bool:
-    """Whether it is three numbers, possibly infinite."""
-    return isinstance(value, tuple) and len(value) == 3 and all(map(is_limit, value))
 
 
 def spread(name: str, value: float | tuple[float, ...], length: int) -> tuple[float, ...]:

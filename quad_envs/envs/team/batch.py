@@ -24,7 +24,7 @@ from ...targets import N_TARGET, make_target
 from ...turning import N_TABLE
 from ..shared.given import given_plants
 from ..shared.tables import checked_rows, disturbance_rows, draw_vehicle, reference_rows, stage_times
-from ..tracking.kernel import COEFFICIENTS, COMMAND, FORCE_MAX, PLANT, task_vector
+from ..tracking.kernel import COEFFICIENTS, COMMAND, FORCE_MAX, MOST_VALUES, PLANT, task_vector
 from .exchange import DISTURBANCE, DRAW, HEAD, MEASURES, NOISE, PLAN, REFERENCE, TARGET, TEAM_ROW_SIZE
 from .kernel import begin_team, scratch_size, step_teams
 from .options import EstimationOptions, FormationOptions, TargetTrackingOptions, TeamOptions
@@ -264,7 +264,7 @@ class TeamBatch:
 def _team_vector(options: TeamOptions) -> Array:
     """The team's part of the task in the form that the kernels read, see `exchange`."""
     task = options.task
-    scales = np.ones(5)
+    scales = np.ones(MOST_VALUES)
     named = constraint_scales(task.limits, task.dt)
     scales[: named.size] = named
     scales[named.size] = task.separation - task.crash_distance

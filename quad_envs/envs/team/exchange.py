@@ -18,20 +18,23 @@ from ...observations.tracking import N_REFERENCE, encode_preview
 from ...parameters import Array
 from ...rotations import sincos
 from ...sensors import measure
-from ..tracking.kernel import DT, PREVIEW, STEP, encode_vehicle
+from ...tasks import LOSS_PARTS
+from ..tracking.kernel import DT, MOST_VALUES, PREVIEW, ROW_SIZE, STEP, encode_vehicle
 
 IntArray = NDArray[np.int64]
 
 # Entries of a vehicle's row beyond those of `kernel`.
-TERMS = 54  # of the stage cost (6) and the scaled violation of each named row (at most 5)
-SLOT_ERROR = 65  # m, distance to the wanted position
-NEAREST = 66  # m, distance to the nearest vehicle, smallest over the substeps
-HEARD = 67  # messages received in this step
-ALIVE = 68
-MEASURES = 69  # whether it has the sensor
-TERMINATED = 70
-LEFT = 71  # whether it crashed in an earlier step
-TEAM_ROW_SIZE = 72
+TERMS = ROW_SIZE  # of the stage cost, then the scaled violation of each named row
+(
+    SLOT_ERROR,  # m, distance to the wanted position
+    NEAREST,  # m, distance to the nearest vehicle, smallest over the substeps
+    HEARD,  # messages received in this step
+    ALIVE,
+    MEASURES,  # whether it has the sensor
+    TERMINATED,
+    LEFT,  # whether it crashed in an earlier step
+    TEAM_ROW_SIZE,
+) = range(TERMS + len(LOSS_PARTS) + MOST_VALUES, TERMS + len(LOSS_PARTS) + MOST_VALUES + 8)
 
 # Entries of a message's content, absolute.
 N_MOTION = 10  # p 3, v 3 (inertial), phi, theta, sin psi, cos psi
@@ -60,8 +63,8 @@ HEAD = 3
     SENSED_SLOTS,  # K_s
 ) = range(15)
 SIGMA = slice(15, 18)  # of range, azimuth, elevation
-SCALES = 18  # of the named rows, at most five
-TEAM_SIZE = 23
+SCALES = 18  # of the named rows
+TEAM_SIZE = SCALES + MOST_VALUES
 
 
 class Tables(NamedTuple):

@@ -9,23 +9,23 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..._numba import inline_kernel, kernel
+from ..._numba import kernel
 from ...adjoint import SCRATCH_ROWS, step_vjp_kernel
-from ...constraints import POSITION_SCALE, TILT_SCALE, TOLERANCE, VELOCITY_SCALE
-from ...parameters import Array
+from ...constraints import TOLERANCE
+from ...parameters import N_STATE, Array
 from ...reward import stage_cost_kernel
 from ...rotations import sincos, wrap_angle_scalar
 from .kernel import (
     ACTION_MAX,
     DT,
-    HAS_POSITION,
+    FIRST,
     HOVER,
     LOWER,
-    RATE_STEP,
+    N_LIMITS,
+    SCALE,
+    STOP,
     SUBSTEPS,
-    TILT,
     UPPER,
-    VELOCITY,
     WEIGHT_Q,
     WEIGHT_R,
 )
@@ -63,11 +63,6 @@ def _stage_cost_vjp(
         bar_command[i] = 2.0 * R[i] * (command[i] - hover)
 
 
-@inline_kernel
-def _sign(value: float) -> float:
-    return 1.0 if value >= 0.0 else -1.0
-
-
 @kernel
 def _violation_vjp(
     x: Array,
@@ -84,36 +79,21 @@ def _violation_vjp(
     for i in range(4):
         bar_command[i], bar_previous[i] = 0.0, 0.0
     cost = 0.0
-    worst = 6 if abs(x[6]) >= abs(x[7]) else 7
-    value = abs(x[worst]) - task[TILT]
-    if value > TOLERANCE:
-        cost += value / TILT_SCALE
-        bar_x[worst] += _sign(x[worst]) / TILT_SCALE
-    worst = 3
-    for i in range(4, 6):
-        worst = i if abs(x[i]) > abs(x[worst]) else worst
-    value = abs(x[worst]) - task[VELOCITY]
-    if value > TOLERANCE:
-        cost += value / VELOCITY_SCALE
-        bar_x[worst] += _sign(x[worst]) / VELOCITY_SCALE
-    if task[HAS_POSITION] > 0.0:
+    for k in range(int(task[N_LIMITS])):
         worst, side, value = 0, 1.0, -np.inf
-        for i in range(3):
-            below, above = task[LOWER][i] - x[i], x[i] - task[UPPER][i]
+        for i in range(int(task[FIRST + k]), int(task[STOP + k])):
+            y = x[i] if i < N_STATE else command[i - N_STATE] - previous[i - N_STATE]
+            below, above = task[LOWER + i] - y, y - task[UPPER + i]
             if max(below, above) > value:
                 worst, side, value = i, 1.0 if above >= below else -1.0, max(below, above)
         if value > TOLERANCE:
-            cost += value / POSITION_SCALE
-            bar_x[worst] += side / POSITION_SCALE
-    if task[RATE_STEP] < np.inf:
-        worst = 0
-        for i in range(1, 4):
-            worst = i if abs(command[i] - previous[i]) > abs(command[worst] - previous[worst]) else worst
-        change = command[worst] - previous[worst]
-        if abs(change) - task[RATE_STEP] > TOLERANCE:
-            cost += (abs(change) - task[RATE_STEP]) / task[RATE_STEP]
-            bar_command[worst] += _sign(change) / task[RATE_STEP]
-            bar_previous[worst] -= _sign(change) / task[RATE_STEP]
+            cost += value / task[SCALE + k]
+            slope = side / task[SCALE + k]
+            if worst < N_STATE:
+                bar_x[worst] += slope
+            else:
+                bar_command[worst - N_STATE] += slope
+                bar_previous[worst - N_STATE] -= slope
     return cost
 
 

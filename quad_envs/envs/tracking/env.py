@@ -69,9 +69,8 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
         "plus" or "x", `mass` 0.8 kg, `gravity` 9.8 m/s^2, `inertia` (0.0224, 0.0224, 0.0436) kg m^2, `arm`
         0.165 m, `yaw_moment` 0.002167 m, `rotor_rate` 50 1/s, `drag` 0 kg/s.
     Limits: `kappa` 1 (largest rotor force as a fraction of the weight, in (1/4, 20]; one number, or one per
-    rotor), `rate_limit` N/s per rotor,
-        `tilt_limit` rad on |roll| and |pitch|, `velocity_limit` m/s on each body velocity, `position_limit`
-        ((x, y, z) lower, (x, y, z) upper) m. No limit but kappa by default.
+        rotor), and `tilt_limit`, `velocity_limit` and the others of `quad_envs.limits.LimitOptions`, which
+        says what each bounds. No limit but kappa by default.
     Task: `reference` (a name, or whatever `quad_envs.references.make_reference` takes), `start` (3 or 12
         numbers, or "reference": on it, with its velocity and heading), `start_box` (half widths: 1 or 3
         numbers of the position or 12 of the state; 1 m, on the reference 0), `time_limit` 10 s (or

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..._numba import inline_kernel, kernel
-from ...constraints import POSITION_SCALE, TILT_SCALE, TOLERANCE, VELOCITY_SCALE, force_from_action
+from ...constraints import TOLERANCE, force_from_action
 from ...dynamics import LANES, SCRATCH_ROWS, advance, load_vehicle, store_vehicle
+from ...limits import LIMITS, N_OUTPUT
 from ...observations.tracking import N_OWN, encode_own, encode_preview
-from ...parameters import N_COEFFICIENTS, Array
+from ...parameters import N_COEFFICIENTS, N_STATE, Array
 from ...reward import stage_cost_kernel
 from ...tasks import CRASH_CAUSES, Task, TeamTask
 from ..shared.vehicle_options import CRASH_TILT
@@ -25,20 +26,26 @@ COMMAND = slice(16, 20)  # last rotor commands, N
 COEFFICIENTS = slice(20, 20 + N_COEFFICIENTS)  # of the true vehicle
 FORCE_MAX = slice(36, 40)  # rotor saturation of the true vehicle, N
 REWARD, STAGE_COST, COST, EPISODE_COST, VIOLATED, CRASHED, TRUNCATED, CLIPPED, STEP = range(40, 49)
-VALUES = 49  # constraint values, one per named row, at most four
-CAUSE = 53  # why it crashed, index in `tasks.CRASH_CAUSES`
-ROW_SIZE = 54
-SCORES = slice(40, 54)  # from the reward to the cause
+VALUES = 49  # constraint values, one per named row
+MOST_VALUES = len(LIMITS) + 1  # a team's last one is the distance between vehicles
+CAUSE = VALUES + MOST_VALUES  # why it crashed, index in `tasks.CRASH_CAUSES`
+ROW_SIZE = CAUSE + 1
+SCORES = slice(REWARD, ROW_SIZE)  # from the reward to the cause
 SCRATCH_SIZE = SCRATCH_ROWS * LANES + 4 * LANES + 16  # integrator, previous commands, one measured plant
 
-# Entries of the task vector. It ends with the diagonals of Q and R.
+# Entries of the task vector.
 DT, SUBSTEPS, HOVER, EPISODE_STEPS, PREVIEW, QUADRATIC, LOST = range(7)
-SEES_POSITION, SEES_DISTURBANCE, TILT, VELOCITY, HAS_POSITION, RATE_STEP, TILT_OF_CRASH = range(7, 14)
-LOWER = slice(14, 17)
-UPPER = slice(17, 20)
-ACTION_MAX = slice(20, 24)  # force of action +1, N
-WEIGHT_Q = slice(24, 36)
-WEIGHT_R = slice(36, 40)
+SEES_POSITION, SEES_DISTURBANCE, TILT_OF_CRASH, N_LIMITS = range(7, 11)  # the last: how many are set
+ACTION_MAX = slice(11, 15)  # force of action +1, N
+WEIGHT_Q = slice(15, 27)
+WEIGHT_R = slice(27, 31)
+# The limits: the box of every output y = [x, u - u_previous], then of each limit that is set its entries.
+LOWER = 31
+UPPER = LOWER + N_OUTPUT
+FIRST = UPPER + N_OUTPUT  # first output of each
+STOP = FIRST + len(LIMITS)  # behind its last output
+SCALE = STOP + len(LIMITS)  # violation that costs the whole reward of a step
+TASK_SIZE = SCALE + len(LIMITS)
 
 _BY_TILT, _NOT_FINITE, _BY_LOSS = map(CRASH_CAUSES.index, ("tilt", "not finite", "lost"))
 BLOCK_FROM = 8  # rows from which a block of lanes is faster than one row at a time
@@ -47,7 +54,9 @@ BLOCK_FROM = 8  # rows from which a block of lanes is faster than one row at a t
 def task_vector(task: Task | TeamTask, substeps: int, lost_distance: float) -> Array:
     """The task in the form that the kernels read."""
     limits = task.limits
-    return np.array(
+    chosen = limits.chosen()
+    vector = np.zeros(TASK_SIZE)
+    vector[:LOWER] = np.array(
         [
             task.dt,
             substeps,
@@ -58,50 +67,38 @@ def task_vector(task: Task | TeamTask, substeps: int, lost_distance: float) -> A
             lost_distance,
             task.layout.position,
             task.layout.disturbance,
-            limits.tilt,
-            limits.velocity,
-            limits.has_position,
-            limits.rate * task.dt,
             CRASH_TILT,
-            *limits.position_lower,
-            *limits.position_upper,
+            len(chosen),
             *task.force_max,
             *task.weights.Q,
             *task.weights.R,
         ],
         dtype=np.float64,
     )
+    vector[LOWER:UPPER], vector[UPPER:FIRST] = limits.output_box(task.dt)
+    for k, limit in enumerate(chosen):
+        vector[FIRST + k], vector[STOP + k] = limit.outputs.start, limit.outputs.stop
+        vector[SCALE + k] = limits.scale(limit, task.dt)
+    return vector
 
 
 @inline_kernel
-def _hinge(row: Array, index: int, value: float, scale: float) -> float:
-    """Record one constraint value; its share of the cost where it is violated."""
-    row[VALUES + index] = value
-    return value / scale if value > TOLERANCE else 0.0
+def output(row: Array, previous: Array, i: int) -> float:
+    """Entry i of y = [x, u - u_previous]."""
+    return float(row[i] if i < N_STATE else row[COMMAND][i - N_STATE] - previous[i - N_STATE])
 
 
 @kernel
 def violation_cost(row: Array, previous: Array, task: Array) -> float:
-    """Sum of hinge / scale over the limits, `constraints.constraint_values` in compiled form."""
-    index, cost = 0, 0.0
-    if task[TILT] < np.inf:
-        cost += _hinge(row, index, max(abs(row[6]), abs(row[7])) - task[TILT], TILT_SCALE)
-        index += 1
-    if task[VELOCITY] < np.inf:
-        speed = max(abs(row[3]), max(abs(row[4]), abs(row[5])))
-        cost += _hinge(row, index, speed - task[VELOCITY], VELOCITY_SCALE)
-        index += 1
-    if task[HAS_POSITION] > 0.0:
+    """Sum of hinge / scale over the limits, `constraints.constraint_values` compiled; records each."""
+    cost = 0.0
+    for k in range(int(task[N_LIMITS])):
         outside = -np.inf
-        for i in range(3):
-            outside = max(outside, max(task[LOWER][i] - row[i], row[i] - task[UPPER][i]))
-        cost += _hinge(row, index, outside, POSITION_SCALE)
-        index += 1
-    if task[RATE_STEP] < np.inf:
-        change = 0.0
-        for i in range(4):
-            change = max(change, abs(row[COMMAND][i] - previous[i]))
-        cost += _hinge(row, index, change - task[RATE_STEP], task[RATE_STEP])
+        for i in range(int(task[FIRST + k]), int(task[STOP + k])):
+            y = output(row, previous, i)
+            outside = max(outside, max(task[LOWER + i] - y, y - task[UPPER + i]))
+        row[VALUES + k] = outside
+        cost += outside / task[SCALE + k] if outside > TOLERANCE else 0.0
     return cost
 
 
