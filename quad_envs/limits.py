@@ -15,7 +15,7 @@ import numpy as np
 
 from .kinds import is_limit, is_number
 from .names import shown
-from .plant import N_INPUT, N_STATE, POSITION, VELOCITY, Array
+from .plant import N_INPUT, N_STATE, POSITION, RATES, VELOCITY, Array
 
 MOST_KAPPA = 20.0  # thrust-to-weight 80, beyond any vehicle; the dissertation has 1
 LEAST_LIMIT = 1e-6  # SI; below, the relative size of a violation means nothing
@@ -52,6 +52,7 @@ LIMITS = (
     Limit("velocity", "m/s", VELOCITY, "each component of the body velocity", 0.5),
     Limit("position", "m", POSITION, "the position, NED", 0.1, box=True),
     Limit("rate", "N", slice(N_STATE, N_OUTPUT), "the change of each rotor command", per_second=True),
+    Limit("body_rate", "rad/s", RATES, "each body rate: p, q, r", 0.5),
 )
 # Of each value in `info["constraint_values"]`; what only teams have is the distance between vehicles.
 UNITS = {limit.name: limit.unit for limit in LIMITS} | {"separation": "m"}
@@ -75,6 +76,7 @@ class Limits:
     velocity: float = math.inf  # m/s, each body velocity component
     position_lower: _Triple = (-math.inf, -math.inf, -math.inf)  # m, NED
     position_upper: _Triple = (math.inf, math.inf, math.inf)  # m, NED
+    body_rate: float = math.inf  # rad/s, |p|, |q| and |r|
 
     def __post_init__(self) -> None:
         if len(self.kappas) != N_INPUT:
@@ -173,6 +175,9 @@ class LimitOptions:
     tilt_limit: float = math.inf  # rad, |roll| and |pitch|
     velocity_limit: float = math.inf  # m/s, each component of the body velocity
     position_limit: tuple[_Triple, _Triple] | None = None  # m, NED: ((x, y, z) lower, (x, y, z) upper)
+    # rad/s, |p|, |q| and |r|. An MPC does not model the 20 ms of the rotors, which these follow at once: it
+    # exceeds its own bound by up to a fifth, and a `margin` of that size keeps the limit.
+    body_rate_limit: float = math.inf
 
     def require_limits(self) -> None:
         """Check the shapes of what was given; `make_limits` checks the values.

@@ -7,9 +7,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from baselines import make_policy, measure, run_episodes
 from controllers.mpc.mpc import limit_rows
 from quad_envs import Limits, formation_v0
 from quad_envs.constraints import constraint_names, constraint_scales, constraint_values, forces_from_actions
+from quad_envs.envs.tracking.adjoint import reward_vjp
+from quad_envs.envs.tracking.kernel import task_vector
 from quad_envs.limits import LIMITS, LimitOptions
 from quad_envs.plant import N_STATE, POSITION
 
@@ -92,3 +95,36 @@ def test_the_docs_say_what_a_limit_bounds(limit):
     hooks = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(hooks)
     assert f"| `{limit.option}` | {limit.about}" in hooks.limits_table()
+
+
+@by_name
+def test_the_adjoint_of_the_cost_is_its_derivative(limit):
+    task = gym.make("quad/HelixTracking-v0", **{limit.option: ALL[limit.option]}).unwrapped.task
+    vector, rng, moved = task_vector(task, 5, 50.0), np.random.default_rng(0), 0
+
+    def cost(y):
+        values = constraint_values(y[:N_STATE], y[N_STATE:], np.zeros(4), task.limits, task.dt)
+        return float((np.maximum(values, 0.0) / constraint_scales(task.limits, task.dt)).sum())
+
+    for y in rng.normal(size=(30, 16)):
+        bar_x, bar_u, bar_previous = np.zeros(12), np.zeros(4), np.zeros(4)
+        reward_vjp(
+            y[:N_STATE], np.zeros(9), y[N_STATE:], np.zeros(4), vector, 0.0, 1.0, bar_x, bar_u, bar_previous,
+            np.zeros(20),
+        )  # fmt: skip
+        slopes = [(cost(y + 1e-6 * e) - cost(y - 1e-6 * e)) / 2e-6 for e in np.eye(16)]
+        np.testing.assert_allclose(np.r_[bar_x, bar_u], slopes, atol=1e-6)
+        np.testing.assert_array_equal(bar_previous, -bar_u)
+        moved += bool(np.any(slopes))
+    assert moved > 10
+
+
+@pytest.mark.parametrize("options", [{}, {"soft_weight": np.inf}], ids=["soft", "hard"])
+@pytest.mark.parametrize("name", ["lmpc", "sdc-nmpc", "nmpc"])
+def test_an_mpc_that_knows_the_limit_on_body_rates_keeps_it(name, options):
+    env = gym.make("quad/RandomTracking-v0", body_rate_limit=0.6)
+    blind = [measure(e) for e in run_episodes(make_policy(name, env, soft_weight=0.0), env, 2)]
+    assert min(record.worst_violation["body_rate"] for record in blind) > 0.4
+    flown = [measure(e) for e in run_episodes(make_policy(name, env, margin=0.12, **options), env, 2)]
+    assert [record.violation_share for record in flown] == [0.0, 0.0]
+    assert not any(record.crashed for record in flown)
