@@ -1,5 +1,4 @@
 # The public names, once: type checkers read this file, and `__init__.py` loads by it.
-from .benchmark import run_benchmark as run_benchmark
 from .errors import CheckpointError as CheckpointError
 from .errors import PolicyCheckError as PolicyCheckError
 from .errors import PolicyError as PolicyError
@@ -23,8 +22,9 @@ from .policies.registry import policy_options as policy_options
 from .policies.sb3_policy import sb3 as sb3
 from .policies.trained import load_policy as load_policy
 from .policies.trained import shipped_policies as shipped_policies
+from .report.benchmark import run_benchmark as run_benchmark
 from .report.figures.episodes import plot_episode as plot_episode
-from .single import evaluate as evaluate
+from .report.single import evaluate as evaluate
 from .sweeps.comparison import Results as Results
 from .sweeps.suite import Suite as Suite
 from .sweeps.suite_files import load_suite as load_suite

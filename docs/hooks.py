@@ -3,14 +3,15 @@
 Equations become MathML when the site is built: `pymdownx.arithmatex` has marked them, their TeX escaped as
 HTML. The one script that the theme would take from the network is the copy in docs/vendor. And tables of what
 the code knows are written from it: the columns of tables, the limits, the hyperparameters of the learners,
-the options of the controllers.
+the options of the controllers, the arguments of `train` and `run_benchmark`.
 """
 
 from __future__ import annotations
 
 import html
+import inspect
 import re
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from typing import Any
 
 _INLINE = re.compile(r'<span class="arithmatex">\\\((.*?)\\\)</span>', re.DOTALL)
@@ -90,9 +91,33 @@ def controller_options_table() -> str:
     return "\n".join(lines)
 
 
+def training_arguments() -> str:
+    """The arguments of `train`, as Markdown."""
+    from baselines.training.request import TrainingRequest
+
+    return _arguments(TrainingRequest)
+
+
+def benchmark_arguments() -> str:
+    """The arguments of `run_benchmark`, as Markdown."""
+    from baselines.report.benchmark import BenchmarkRequest
+
+    return _arguments(BenchmarkRequest)
+
+
+def _arguments(kind: type[Any]) -> str:
+    """The arguments of a function whose arguments are the fields of a dataclass."""
+    from quad_envs.field_comments import field_comments
+
+    defaults = {field.name: field.default for field in fields(kind)}
+    values = {name: defaults[name] for name in inspect.signature(kind).parameters}
+    return "\n".join(_rows("argument", values, field_comments(kind)))
+
+
 def _rows(what: str, values: dict[str, Any], comments: dict[str, str]) -> list[str]:
     """A table of fields, their defaults and comments."""
-    rows = [f"| `{key}` | `{value!r}` | {comments[key]} |" for key, value in values.items()]
+    shown = {key: "" if value is MISSING else f"`{value!r}`" for key, value in values.items()}
+    rows = [f"| `{key}` | {value} | {comments[key]} |" for key, value in shown.items()]
     return [f"| {what} | default | |", "|---|---|---|", *rows]
 
 
@@ -102,6 +127,8 @@ _TABLES = {
     "<!-- table: limits -->": limits_table,
     "<!-- table: hyperparameters -->": hyperparameter_tables,
     "<!-- table: controller options -->": controller_options_table,
+    "<!-- table: arguments of train -->": training_arguments,
+    "<!-- table: arguments of run_benchmark -->": benchmark_arguments,
 }
 
 

@@ -1,4 +1,4 @@
-"""What the fields of a dataclass mean, read from the comments beside them: written once, shown everywhere."""
+"""The fields of a dataclass, written once: what they mean, and as the arguments of a function."""
 
 from __future__ import annotations
 
@@ -7,8 +7,14 @@ import inspect
 import io
 import textwrap
 import tokenize
+from collections.abc import Callable
 from dataclasses import fields
-from typing import Any
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+Fields = ParamSpec("Fields")
+Value = TypeVar("Value")
+Returned = TypeVar("Returned")
 
 
 def field_comments(kind: type[Any]) -> dict[str, str]:
@@ -46,3 +52,30 @@ def _own_comments(kind: type[Any]) -> dict[str, str]:
         for node in tree.body
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
     }
+
+
+def called_with(
+    kind: Callable[Fields, Value],
+) -> Callable[[Callable[[Value], Returned]], Callable[Fields, Returned]]:
+    """Make of a function of one value a function of the value's fields, to which its docstring adds them.
+
+    Args:
+        kind: The dataclass of the value.
+    """
+
+    def of_fields(function: Callable[[Value], Returned]) -> Callable[Fields, Returned]:
+        @wraps(function)
+        def call(*args: Fields.args, **kwargs: Fields.kwargs) -> Returned:
+            return function(kind(*args, **kwargs))
+
+        del call.__wrapped__
+        signature = inspect.signature(kind)
+        call.__signature__ = signature.replace(  # type: ignore[attr-defined]
+            return_annotation=function.__annotations__["return"]
+        )
+        comments = field_comments(kind)  # type: ignore[arg-type]
+        lines = [f"    {name}: {comments[name]}" for name in signature.parameters]
+        call.__doc__ = "\n".join([inspect.getdoc(function) or "", "", "Args:", *lines])
+        return call
+
+    return of_fields

@@ -12,6 +12,7 @@ from baselines import evaluate, make_policy, run_benchmark
 from baselines.certify import certify
 from baselines.sweeps.suite import EnvChoice, PolicyChoice, Suite
 from baselines.training.plans import make_plan
+from baselines.training.request import TrainingRequest
 from quad_envs import checks, cooperative_estimation_v0, formation_v0, target_tracking_v0
 from quad_envs.checks import Bound, require_memory, require_number, require_whole
 from quad_envs.disturbances import Gusts, Steady
@@ -457,4 +458,4 @@ def test_processes_that_the_memory_does_not_hold_are_refused(monkeypatch):
 )
 def test_hyperparameters_that_no_machine_holds_are_refused(algorithm, hyper):
     with pytest.raises(ValueError, match=f"{next(iter(hyper))}|observations of"):
-        make_plan(HELIX, algorithm, steps=1000, hyper=hyper)
+        make_plan(TrainingRequest(HELIX, algorithm, steps=1000, hyper=hyper))

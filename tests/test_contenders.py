@@ -70,7 +70,7 @@ def test_training_seeds_are_one_contender_and_the_base_is_no_better_than_itself(
 
 def test_networks_are_trained_once_and_may_lie_elsewhere(tmp_path, monkeypatch):
     first = run_benchmark(LEARNED, tmp_path / "a", networks=tmp_path / "nets")
-    monkeypatch.setattr("baselines.sweeps.finished.train", None)  # it would fail
+    monkeypatch.setattr("baselines.sweeps.finished.run_training", None)  # it would fail
     second = run_benchmark(LEARNED, tmp_path / "b", networks=tmp_path / "nets", jobs=1)
     scores = [[row["score"] for row in results.rows()] for results in (first, second)]
     assert scores[0] == scores[1] and not (tmp_path / "a" / "networks").exists()

@@ -17,7 +17,9 @@ from typing import NamedTuple
 import pytest
 
 from baselines.__main__ import main, make_parser
+from baselines.report.benchmark import BenchmarkRequest
 from baselines.training.algorithms import ALGORITHMS
+from baselines.training.request import TrainingRequest
 from controllers import LmpcOptions, NmpcOptions, SdcOptions
 from controllers.feedback.options import FeedbackLinearizationOptions, LqrOptions, SdreOptions
 from quad_envs.field_comments import field_comments
@@ -181,6 +183,15 @@ def test_the_page_on_training_gets_every_hyperparameter_with_its_meaning():
         for field, comment in field_comments(entry.options).items():
             row = next(line for line in table.splitlines() if line.startswith(f"| `{field}` |"))
             assert row.endswith(f"| {comment} |") and row.count("|") == 4
+
+
+@pytest.mark.parametrize("kind", [TrainingRequest, BenchmarkRequest])
+def test_the_page_on_baselines_gets_the_arguments_of_long_functions(kind):
+    page = ROOT / "docs" / "api" / "baselines.md"
+    text = script("hooks").on_page_markdown(page.read_text(encoding="utf-8"))
+    for field, comment in field_comments(kind).items():
+        rows = [line for line in text.splitlines() if line.startswith(f"| `{field}` |")]
+        assert comment and any(line.endswith(f"| {comment} |") and line.count("|") == 4 for line in rows)
 
 
 LAWS = (SdreOptions, LqrOptions, FeedbackLinearizationOptions)

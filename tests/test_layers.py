@@ -10,7 +10,7 @@ LAYERS = ["quad_envs", "controllers", "baselines", "benchmarks"]
 # Rooms of a package from the ground up: a room imports from those before it.
 FLOORS = {
     "controllers": "qp fallback disturbance controller model estimation mpc feedback team stability",
-    "baselines": "interruptions errors files policies evaluation training sweeps report benchmark single "
+    "baselines": "interruptions errors files policies evaluation training sweeps report "
     "reproduction certify cli __main__",
 }
 

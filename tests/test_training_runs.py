@@ -1,10 +1,14 @@
 """Training runs: budgets, curves, what the folder holds, how they end and go on. The algorithms are stubs."""
 
 import csv
+import inspect
 import io
 import json
+import shlex
 import signal
 import time
+from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,9 +16,9 @@ from processes import start_command
 from stub_training import stubs  # noqa: F401
 
 from baselines import CheckpointError, ResultsError, TrainingError, evaluate, make_policy, train
-from baselines.__main__ import main
-from baselines.cli.options import TrainOptions
-from baselines.cli.train import resume_command
+from baselines.__main__ import main, make_parser
+from baselines.cli.options import TrainOptions, read_options
+from baselines.cli.train import requested
 from baselines.errors import MissingPackageError
 from baselines.files import locked
 from baselines.policies.checkpoints import load_checkpoint
@@ -22,6 +26,7 @@ from baselines.training.algorithms import ALGORITHMS, options_of
 from baselines.training.clock import Budget
 from baselines.training.held_out import CHOOSING, Point, better, training_options
 from baselines.training.hyperparameters import hyperparameter_file, hyperparameters
+from baselines.training.request import TrainingRequest
 from baselines.training.watching import Display
 from quad_envs.registration import TEAMS, TRACKING
 
@@ -304,10 +309,37 @@ def test_ctrl_c_says_how_to_go_on(tmp_path, capsys):
     ]
     assert main([*arguments, "--out", str(out)]) == 130
     said = capsys.readouterr().err.splitlines()[-1]
-    command = resume_command(
-        TrainOptions(HELIX, "stub", steps=500, hyper=["fails_at=3", "how=interrupt"]), out
+    asked = TrainingRequest(
+        *(HELIX, "stub"), steps=500, out=out, hyper={"fails_at": 3, "how": "interrupt"}, resume=True
     )
-    assert said.endswith(command) and command.endswith("--resume") and f"'{out}'" in command
+    assert said.endswith(asked.command) and asked.command.endswith("--resume") and f"'{out}'" in said
+
+
+def test_the_command_of_a_training_asks_for_the_same_training():
+    request = TrainingRequest(
+        HELIX,
+        "apg",
+        seed=3,
+        seconds=2.5,
+        out="runs/a b",
+        env_kwargs={"kappa": 0.3125, "limits": {"tilt": 0.35}},
+        hyper={"net_arch": [8, 8], "squash": "clip"},
+        start_from="o'clock",
+        resume=True,
+    )
+    words = shlex.split(request.command)
+    assert words[:2] == ["quad-envs", "train"]
+    found = read_options(TrainOptions, make_parser().parse_args(words[1:]))
+    assert requested(found) == replace(request, out=Path("runs/a b"))
+
+
+def test_train_takes_the_fields_of_a_request():
+    parameters = inspect.signature(train).parameters
+    assert list(parameters) == [entry.name for entry in fields(TrainingRequest)]
+    assert parameters["hyper"].kind is inspect.Parameter.KEYWORD_ONLY
+    assert "    hyper: hyperparameters that differ from the committed ones" in train.__doc__
+    with pytest.raises(TypeError, match="unexpected keyword argument 'hypre'"):
+        train(HELIX, "stub", hypre={})
 
 
 @pytest.mark.slow

@@ -174,10 +174,10 @@ def _list_options(options: ListOptions) -> int:
 
 def evaluate_one(options: EvaluateOptions) -> int:
     """Fly one policy in one environment and print the numbers."""
-    from ..benchmark import run_benchmark
     from ..evaluation.evaluate import fly_and_measure
     from ..policies.environments import make_env
     from ..policies.registry import make_policy, policy_name
+    from ..report.benchmark import run_benchmark
     from ..sweeps.suite import EnvChoice, PolicyChoice, Suite
 
     env_kwargs = read_assignments("--set", options.set)
@@ -208,7 +208,7 @@ def evaluate_one(options: EvaluateOptions) -> int:
 
 def benchmark_suite(options: BenchmarkOptions) -> int:
     """Fly a suite, print its tables, and leave a results folder."""
-    from ..benchmark import fly_suite
+    from ..report.benchmark import fly_suite
     from ..sweeps.stages import SweepProgress
     from ..sweeps.suite import PolicyChoice
     from ..sweeps.suite_files import load_suite
@@ -229,13 +229,13 @@ def benchmark_suite(options: BenchmarkOptions) -> int:
         raise_lost()
 
     order = Order(
-        options.engine,
-        options.jobs,
-        options.save_episodes,
-        options.fresh,
-        options.networks,
-        on_unit,
-        watcher,
+        engine=options.engine,
+        jobs=options.jobs,
+        save_episodes=options.save_episodes,
+        fresh=options.fresh,
+        networks=options.networks,
+        on_unit=on_unit,
+        watcher=watcher,
     )
     with plain_warnings():
         try:

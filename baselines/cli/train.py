@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import shlex
-from pathlib import Path
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from ..errors import TrainingError
 from ..files import plain_json
@@ -12,34 +13,23 @@ from ..interruptions import exit_code
 from .commands import plain_warnings, say
 from .options import TrainOptions, read_assignments
 
+if TYPE_CHECKING:
+    from ..training.request import TrainingRequest
+
 _DIVERGED = 1
 
 
 def train_one(options: TrainOptions) -> int:
     """Train, print what came out, and leave a checkpoint."""
     from ..training.algorithms import resumable
-    from ..training.runs import default_folder, train
+    from ..training.runs import run_training
     from ..training.watching import Display, describe
 
-    env_kwargs, hyper = read_assignments("--set", options.set), read_assignments("--hyper", options.hyper)
-    out = options.out or default_folder(options.env, options.algorithm, options.seed)
-    display = Display(f"{options.algorithm} on {options.env}")
+    request = requested(options)
+    display, out = Display(f"{options.algorithm} on {options.env}"), request.folder
     with plain_warnings():
         try:
-            result = train(
-                options.env,
-                options.algorithm,
-                seed=options.seed,
-                seconds=options.seconds,
-                steps=options.steps,
-                out=out,
-                env_kwargs=env_kwargs,
-                hyper=hyper,
-                start_from=options.from_ or None,
-                resume=options.resume,
-                fresh=options.fresh,
-                watcher=display,
-            )
+            result = run_training(replace(request, watcher=display))
         except TrainingError as error:
             say(f"quad-envs: {error}")
             return _DIVERGED
@@ -48,7 +38,8 @@ def train_one(options: TrainOptions) -> int:
             if not (out / "policy.json").exists():
                 say("interrupted before the first policy, nothing is saved: the same command begins anew")
             elif resumable(options.algorithm):
-                say(f"interrupted; the policy is saved. Resume with: {resume_command(options, out)}")
+                go_on = replace(request, out=out, resume=True, fresh=False)
+                say(f"interrupted; the policy is saved. Resume with: {go_on.command}")
             else:
                 say(f"interrupted; the best policy is in {out}. {options.algorithm} cannot be resumed")
             return exit_code(interruption)
@@ -62,21 +53,20 @@ def train_one(options: TrainOptions) -> int:
     return 0
 
 
-def resume_command(options: TrainOptions, out: Path) -> str:
-    """The command line that goes on with a run."""
-    from ..training.command_line import training_command
+def requested(options: TrainOptions) -> TrainingRequest:
+    """What the command line asks for."""
+    from ..training.request import TrainingRequest
 
-    return (
-        training_command(
-            options.env,
-            options.algorithm,
-            options.seed,
-            options.seconds,
-            options.steps,
-            str(out),
-            options.set,
-            options.hyper,
-            options.from_,
-        )
-        + " --resume"
+    return TrainingRequest(
+        options.env,
+        options.algorithm,
+        seed=options.seed,
+        seconds=options.seconds,
+        steps=options.steps,
+        out=options.out,
+        env_kwargs=read_assignments("--set", options.set),
+        hyper=read_assignments("--hyper", options.hyper),
+        start_from=options.from_ or None,
+        resume=options.resume,
+        fresh=options.fresh,
     )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from ..errors import CheckpointError
 from ..training.algorithms import resumable
 from ..training.plans import Plan, make_plan, read_start
-from ..training.runs import TrainingResult, train
+from ..training.request import TrainingRequest
+from ..training.runs import TrainingResult, run_training
 from .units import TrainingUnit
 
 
@@ -18,13 +20,18 @@ def training_plan(unit: TrainingUnit) -> Plan:
         ValueError: If it cannot be trained.
         MissingPackageError: If what the algorithm needs is not installed.
     """
+    return make_plan(_request(unit))
+
+
+def _request(unit: TrainingUnit) -> TrainingRequest:
     said = unit.training
-    return make_plan(
+    return TrainingRequest(
         unit.env.id,
         unit.policy.name,
         seed=said.seed,
         seconds=said.seconds,
         steps=said.steps,
+        out=unit.folder,
         env_kwargs=unit.env.kwargs,
         hyper=said.hyper,
     )
@@ -41,18 +48,8 @@ def train_unit(unit: TrainingUnit) -> dict[str, Any]:
     found = _finished(unit, plan)
     if found is None:
         go_on = (unit.folder / "last").is_dir() and resumable(plan.algorithm)
-        found = train(
-            plan.env_id,
-            plan.algorithm,
-            seed=plan.seed,
-            seconds=plan.budget.seconds,
-            steps=plan.budget.steps,
-            out=unit.folder,
-            env_kwargs=plan.env_kwargs,
-            hyper=unit.training.hyper,
-            resume=go_on,
-            fresh=(unit.folder / "config.json").exists() and not go_on,
-        )
+        fresh = (unit.folder / "config.json").exists() and not go_on
+        found = run_training(replace(_request(unit), resume=go_on, fresh=fresh))
     return found.to_dict()
 
 

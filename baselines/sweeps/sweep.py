@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 from ..errors import PolicyError, ResultsError
 from ..evaluation.evaluate import Evaluation
@@ -46,16 +47,25 @@ class Watcher(Protocol):
         """A unit was flown just now, or came from another process."""
 
 
-class Order(NamedTuple):
-    """How a suite is to be flown; see `run_benchmark`."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Order:
+    """How a suite is to be flown; the comment of a field is its documentation everywhere."""
 
-    engine: str = "processes"
-    jobs: int = 1
-    save_episodes: bool = False
-    fresh: bool = False
-    networks: str | Path | None = None
-    on_unit: Callable[[int, int], None] | None = None
-    watcher: Watcher | None = None
+    engine: str = "processes"  # or "ray" or "dask"
+    jobs: int = 1  # units flown at a time
+    save_episodes: bool = (
+        False  # whether to write every flight to out/episodes, and not only the first REPORTED of each unit,
+        # which the report shows
+    )
+    fresh: bool = False  # whether to discard what the folder holds of an earlier run, but for networks
+    networks: str | Path | None = (
+        None  # where networks that the suite trains are, or go; out/networks if not given; those that are
+        # trained as the suite wants are taken as they are
+    )
+    on_unit: Callable[[int, int], None] | None = (
+        None  # called with (finished, all) at the beginning and after each unit
+    )
+    watcher: Watcher | None = None  # follows what is trained and flown
 
 
 def with_given(units: Sequence[Unit], given: Mapping[str, Given]) -> list[Unit]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,9 +15,9 @@ from ..policies.trained import checkpoint_folder
 from .algorithm_options import check_sizes
 from .algorithms import algorithm_for, require_packages, require_resumable
 from .clock import Budget
-from .command_line import assignments, training_command
 from .held_out import Point, read_point, training_options
 from .hyperparameters import hyperparameters, plain_options
+from .request import TrainingRequest
 from .run_folder import RunFolder
 
 _ORIGIN = ("env_id", "algorithm", "seed", "steps", "digest")  # what is said of a network to begin with
@@ -56,39 +55,33 @@ class Start(NamedTuple):
     best: Point | None = None
 
 
-def make_plan(
-    env_id: str,
-    algorithm: str,
-    seed: int = 0,
-    seconds: float | None = None,
-    steps: int | None = None,
-    env_kwargs: Mapping[str, Any] | None = None,
-    hyper: Mapping[str, Any] | None = None,
-    start_from: str | Path | None = None,
-) -> Plan:
-    """A training, its arguments as those of `train`.
+def make_plan(request: TrainingRequest) -> Plan:
+    """What is asked for, checked.
 
     Raises:
         ValueError: If an argument is not allowed or the algorithm cannot act on the task.
         MissingPackageError: If what the algorithm needs is not installed.
         CheckpointError: If there is no checkpoint where it is to begin.
     """
+    env_id, algorithm, seed = request.env_id, request.algorithm, request.seed
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < _SEEDS:
         raise ValueError(
             f"seed of a training must be a whole number, 0 to {_SEEDS - 1}, got {shown(seed)}; later ones "
             "are held out for evaluation"
         )
-    kwargs = dict(env_kwargs or {})
+    kwargs = dict(request.env_kwargs or {})
     task_options = training_options(env_id, kwargs)
     mission = task_options.task.mission
     entry = algorithm_for(algorithm, mission)
-    budget = Budget(entry.seconds if seconds is None and steps is None else seconds, steps)
+    seconds = entry.seconds if request.seconds is None and request.steps is None else request.seconds
+    budget = Budget(seconds, request.steps)
     require_packages(algorithm)
     env_id = env_id.removeprefix("quad_envs:")
-    options = hyperparameters(algorithm, env_id, hyper)
+    options = hyperparameters(algorithm, env_id, request.hyper)
     check_sizes(options, task_options.task.layout.size)
-    network, origin = (None, None) if start_from is None else _origin(start_from, algorithm)
-    texts = assignments(kwargs), assignments(hyper or {}), str(start_from or "")
+    source = request.start_from
+    network, origin = (None, None) if source is None else _origin(source, algorithm)
+    made_by = replace(request, env_id=env_id, seconds=budget.seconds, out=None, resume=False)
     about = {
         "env_id": env_id,
         "env_kwargs": {key: value if _is_plain(value) else repr(value) for key, value in kwargs.items()},
@@ -98,7 +91,7 @@ def make_plan(
         "seed": seed,
         "hyperparameters": plain_options(options),
         "start_from": origin,
-        "made_by": training_command(env_id, algorithm, seed, budget.seconds, budget.steps, "", *texts),
+        "made_by": made_by.command,
     }
     return Plan(env_id, kwargs, algorithm, seed, budget, task_options, options, about, network)
 

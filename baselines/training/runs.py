@@ -6,11 +6,13 @@ Nothing here knows an algorithm: each is a generator, see `algorithms`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from quad_envs.field_comments import called_with
 
 from ..errors import CheckpointError, ResultsError, TrainingError
 from ..files import locked
@@ -20,6 +22,7 @@ from .algorithms import generator_of, require_resumable
 from .clock import TrainingClock
 from .held_out import CHOOSING, HeldOutFlights, Point, Progress, better
 from .plans import Plan, Start, make_plan, read_start
+from .request import TrainingRequest
 from .run_folder import RunFolder
 from .watching import Watcher, tensorboard_log
 
@@ -51,49 +54,12 @@ class TrainingResult:
         }
 
 
-def default_folder(env_id: str, algorithm: str, seed: int) -> Path:
-    """Where a training goes if no folder is named."""
-    task = env_id.rsplit("/", 1)[-1].removesuffix("-v0")
-    return Path("runs") / f"{algorithm}-{task}-{seed}"
-
-
-def train(
-    env_id: str,
-    algorithm: str,
-    *,
-    seed: int = 0,
-    seconds: float | None = None,
-    steps: int | None = None,
-    out: str | Path | None = None,
-    env_kwargs: Mapping[str, Any] | None = None,
-    hyper: Mapping[str, Any] | None = None,
-    start_from: str | Path | None = None,
-    resume: bool = False,
-    fresh: bool = False,
-    watcher: Watcher | None = None,
-) -> TrainingResult:
+@called_with(TrainingRequest)
+def train(request: TrainingRequest) -> TrainingResult:
     """Train a network, and leave a folder that is a checkpoint of the best one.
 
     Equal seeds and a budget in steps give equal runs; one in CPU-seconds ends where the machine's speed has
     it end. Ctrl-C saves and is raised again.
-
-    Args:
-        env_id: Id of the task.
-        algorithm: One of `algorithms.ALGORITHMS`.
-        seed: Of everything random, 0 to 4 999.
-        seconds: Budget in CPU-seconds, without compilation and evaluation; the algorithm's own if neither
-            this nor `steps` is given.
-        steps: Budget in environment steps instead.
-        out: Folder; `default_folder` if not given.
-        env_kwargs: Of the environment.
-        hyper: Hyperparameters that differ from the committed ones.
-        start_from: Checkpoint, or shipped policy, whose network it begins with: with the features, the hidden
-            layers and the squash of this training.
-        resume: Go on with the run in the folder until the whole budget is used. The weights, the counters,
-            the learning rate's place in its schedule and the curve are restored; the optimiser's averages,
-            a critic, collected data and the random streams begin anew.
-        fresh: Discard the run that is in the folder.
-        watcher: Hears of the progress.
 
     Raises:
         ValueError: If an argument is not allowed or the algorithm cannot act on the task.
@@ -102,21 +68,25 @@ def train(
         CheckpointError: If a policy cannot be written or read.
         TrainingError: If training diverges; the last good policies are kept.
     """
-    if resume and fresh:
-        raise ValueError("either resume or fresh: a run that is discarded cannot go on")
-    plan = make_plan(env_id, algorithm, seed, seconds, steps, env_kwargs, hyper, start_from)
-    path = default_folder(env_id, algorithm, seed) if out is None else Path(out)
-    held_out = HeldOutFlights(env_id, plan.env_kwargs)
+    return run_training(request)
+
+
+def run_training(request: TrainingRequest) -> TrainingResult:
+    """Do what is asked for, see `train`."""
+    plan, path = make_plan(request), request.folder
+    held_out = HeldOutFlights(plan.env_id, plan.env_kwargs)
     with remembered(), locked(path):
         folder = plan.folder(path)
-        if resume:
+        if request.resume:
             start = _resume(folder, plan)
         else:
-            folder.begin(fresh)
+            folder.begin(request.fresh)
             start = Start(plan.network)
-        run = _Run(folder, plan, held_out, start, watcher)
+        run = _Run(folder, plan, held_out, start, request.watcher)
         run.go()
-        return TrainingResult(path, plan.env_id, algorithm, seed, run.best_point(), tuple(run.curve))
+        return TrainingResult(
+            path, plan.env_id, plan.algorithm, plan.seed, run.best_point(), tuple(run.curve)
+        )
 
 
 def _resume(folder: RunFolder, plan: Plan) -> Start:

@@ -3,41 +3,46 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from .evaluation.amounts import require_jobs
-from .files import locked, write_atomic
-from .policies.environments import make_env
-from .policies.outside import name_of
-from .policies.registry import from_outside, is_trained, make_policy, policy_entry
-from .report import render_report
-from .sweeps.comparison import Results
-from .sweeps.engines import check_engine
-from .sweeps.finished import training_plan
-from .sweeps.folder import read_run
-from .sweeps.suite import PolicyChoice, Suite
-from .sweeps.suite_files import load_suite
-from .sweeps.sweep import Order, Sweep, with_given
-from .sweeps.units import Given, Unit, suite_units, training_units
+from quad_envs.field_comments import called_with
+
+from ..evaluation.amounts import require_jobs
+from ..files import locked, write_atomic
+from ..policies.environments import make_env
+from ..policies.outside import name_of
+from ..policies.registry import from_outside, is_trained, make_policy, policy_entry
+from ..sweeps.comparison import Results
+from ..sweeps.engines import check_engine
+from ..sweeps.finished import training_plan
+from ..sweeps.folder import read_run
+from ..sweeps.suite import PolicyChoice, Suite
+from ..sweeps.suite_files import load_suite
+from ..sweeps.sweep import Order, Sweep, with_given
+from ..sweeps.units import Given, Unit, suite_units, training_units
+from .build import render_report
 
 
-def run_benchmark(
-    suite: str | Path | Mapping[str, Any] | Suite = "default",
-    out: str | Path | None = None,
-    *,
-    policies: Mapping[str, Any] | None = None,
-    engine: str = "processes",
-    jobs: int = 1,
-    save_episodes: bool = False,
-    fresh: bool = False,
-    networks: str | Path | None = None,
-    on_unit: Callable[[int, int], None] | None = None,
-) -> Results:
+@dataclass(frozen=True, slots=True)
+class BenchmarkRequest(Order):
+    """The arguments of `run_benchmark`; the comment of a field is its documentation everywhere."""
+
+    suite: str | Path | Mapping[str, Any] | Suite = "default"  # name of a shipped one, or path of a TOML file
+    out: str | Path | None = None  # results folder; None keeps the results in memory only
+    _: KW_ONLY
+    policies: Mapping[str, Any] | None = (
+        None  # label -> policy that flies beside those of the suite, in all of its environments: anything
+        # with `predict`, a factory, or a name
+    )
+
+
+@called_with(BenchmarkRequest)
+def run_benchmark(request: BenchmarkRequest) -> Results:
     """Fly every policy of a suite in every environment, from the same starts.
 
     Networks that the suite trains come first. An interrupted run goes on where it stopped when it is called
@@ -49,27 +54,13 @@ def run_benchmark(
     A policy from outside that cannot be made, or breaks off, ends its own units only: a warning says so at
     once, and `Results.failures` in the end.
 
-    Args:
-        suite: Name of a shipped suite, path of a TOML file, mapping, or Suite.
-        out: Results folder; None keeps the results in memory only.
-        policies: Label -> policy that flies beside those of the suite: anything with `predict`, a factory, or
-            a name. It flies in all environments of the suite.
-        engine: "processes", "ray" or "dask".
-        jobs: Units flown at a time, >= 1.
-        save_episodes: Whether to write every flight to out/episodes, and not only the first REPORTED of each
-            unit, which the report shows.
-        fresh: Whether to discard what the folder holds of an earlier run, but for trained networks.
-        networks: Where networks that the suite trains are, or go; out/networks if not given. Those that are
-            trained as the suite wants are taken as they are.
-        on_unit: Called with (finished, all) at the beginning and after each unit.
-
     Raises:
         ValueError: If the suite, the engine or an option is not valid; before anything is flown.
         PolicyError: If nothing but policies from outside was to be flown, and all of them broke off.
         ResultsError: If the folder is in use, holds another suite, or cannot be written.
     """
-    suite, given = _with_policies(load_suite(suite), policies or {})
-    return fly_suite(suite, given, out, Order(engine, jobs, save_episodes, fresh, networks, on_unit))
+    suite, given = _with_policies(load_suite(request.suite), request.policies or {})
+    return fly_suite(suite, given, request.out, request)
 
 
 def _with_policies(suite: Suite, policies: Mapping[str, Any]) -> tuple[Suite, dict[str, Given]]:

@@ -10,17 +10,17 @@ from typing import Any
 from quad_envs.names import shown
 from quad_envs.tasks import BaseTask, TeamTask
 
+from ..evaluation.episode import Episode
+from ..evaluation.evaluate import Evaluation, fly_and_measure
+from ..files import plain_json
+from ..policies.environments import require_own_task
+from ..policies.outside import name_of
+from ..policies.protocol import Policy
+from ..policies.registry import policy_name
+from ..sweeps.suite import EnvChoice, PolicyChoice, Suite
+from ..sweeps.sweep import Order
+from ..sweeps.units import Given
 from .benchmark import fly_suite
-from .evaluation.episode import Episode
-from .evaluation.evaluate import Evaluation, fly_and_measure
-from .files import plain_json
-from .policies.environments import require_own_task
-from .policies.outside import name_of
-from .policies.protocol import Policy
-from .policies.registry import policy_name
-from .sweeps.suite import EnvChoice, PolicyChoice, Suite
-from .sweeps.sweep import Order
-from .sweeps.units import Given
 
 
 def evaluate(
