@@ -29,28 +29,54 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ._numba import inline_kernel
+from ._numba import Int, inline_kernel
 from .names import unknown_name
 from .parameters import Array
 
-SENSORS = ("range", "range-azimuth-elevation")
 N_MEASUREMENT = 3  # range, m; azimuth, rad; elevation, rad
 RANGE, AZIMUTH, ELEVATION = range(N_MEASUREMENT)
+# Name -> entries of a measurement that the sensor reads; all else follows from them.
+SENSORS = {
+    "range": slice(RANGE, AZIMUTH),
+    "range-azimuth-elevation": slice(RANGE, N_MEASUREMENT),
+}
 MIN_HORIZONTAL_SQUARED = 1e-6  # m^2, smallest s^2 in a division
 OVERHEAD = 8.0  # the angles count where s > OVERHEAD sigma_el rho, the direction elsewhere
 
+_PER_FIRST = 4  # in `sensor_rows`
 _Row = tuple[float, float, float]
 
 
 def sensor_rows(sensor: str) -> int:
-    """Numbers in a measurement of this sensor: the first 1 or 3 of range, azimuth, elevation.
+    """What of range, azimuth, elevation this sensor reads, as one number: how many, + 4 times the first.
+
+    So 1 is the range, 3 are all of them; `first_row` and `row_count` take it apart.
 
     Raises:
         ValueError: If there is no such sensor.
     """
     if sensor not in SENSORS:
-        raise ValueError(unknown_name("sensor", sensor, SENSORS))
-    return 1 if sensor == "range" else N_MEASUREMENT
+        raise ValueError(unknown_name("sensor", sensor, tuple(SENSORS)))
+    read = SENSORS[sensor]
+    return int(read.stop - read.start + _PER_FIRST * read.start)
+
+
+@inline_kernel
+def first_row(rows: Int) -> int:
+    """The first entry of a measurement that a sensor reads, see `sensor_rows`."""
+    return int(rows // _PER_FIRST)
+
+
+@inline_kernel
+def row_count(rows: Int) -> int:
+    """How many entries of a measurement a sensor reads, see `sensor_rows`."""
+    return int(rows % _PER_FIRST)
+
+
+@inline_kernel
+def reads(rows: Int, entry: int) -> bool:
+    """Whether a sensor reads RANGE, AZIMUTH or ELEVATION, see `sensor_rows`."""
+    return bool(first_row(rows) <= entry < first_row(rows) + row_count(rows))
 
 
 @inline_kernel

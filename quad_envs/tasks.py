@@ -81,7 +81,7 @@ class TeamTask(BaseTask):
     sensing_radius: float = 2.0  # m, R_s
     formation_weight: float = 1.0  # of the formation error in the stage cost
     spanning_tree: bool = True  # whether news from the leader, or from who measures, can reach everybody
-    sensor: str = ""  # of the target: "range" or "range-azimuth-elevation"; empty where there is none
+    sensor: str = ""  # of the target, a name of `sensors.SENSORS`; empty where there is none
     sensor_sigma: _Triple = (0.1, 0.02, 0.02)  # m, rad, rad: range, azimuth, elevation
     prior_velocity: _Triple = (0.0, 0.0, 0.0)  # m/s, of the target at the start; its position is p - slot
     prior_sigma: tuple[float, float] = (3.0, 1.0)  # m, m/s, standard deviation of that guess, each axis

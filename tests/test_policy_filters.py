@@ -10,6 +10,7 @@ from baselines import make_policy
 from baselines.policies.registry import TEAM_POLICIES, serving
 from controllers.estimation import ekf
 from quad_envs import cooperative_estimation_v0, formation_v0, target_tracking_v0
+from quad_envs.sensors import sensor_rows
 
 MODULES = {"target-tracking": target_tracking_v0, "estimation": cooperative_estimation_v0}
 HONEST = [
@@ -36,7 +37,7 @@ def twin_filter(env, flight, agent, q):
         ages = np.concatenate([[0.0], view.comm[:, 1]])
         measured = view.measured
         z = np.stack([measured[:, 1], np.arctan2(measured[:, 2], measured[:, 3]), measured[:, 4]], axis=1)
-        rows_used = 1 if task.sensor == "range" else 3
+        rows_used = sensor_rows(task.sensor)
         belief, _ = ekf.update(
             belief, z[None], places[None], ages[None], measured[None, :, 0] > 0, task.sensor_sigma, rows_used
         )

@@ -17,6 +17,7 @@ from quad_envs.sensors import (
     jacobian_rows,
     measure,
     range_azimuth_elevation,
+    reads,
     sensor_rows,
 )
 
@@ -147,6 +148,9 @@ def test_variances_of_the_direction_never_vanish(elevation):
 
 
 def test_sensors_are_named():
-    assert [sensor_rows(sensor) for sensor in SENSORS] == [1, 3]
+    assert sensor_rows("range") == 1 and sensor_rows("range-azimuth-elevation") == 3
+    for sensor, read in SENSORS.items():
+        rows = sensor_rows(sensor)
+        assert [entry for entry in range(3) if reads(rows, entry)] == list(range(read.start, read.stop))
     with pytest.raises(ValueError, match="unknown sensor 'rnage'; did you mean 'range'"):
         sensor_rows("rnage")

@@ -22,7 +22,7 @@ from quad_envs.envs.team.kernel import ESTIMATE_REACH, ESTIMATE_SPEED
 from quad_envs.names import shown, unknown_name
 from quad_envs.observations.team import N_ESTIMATE
 from quad_envs.parameters import Array
-from quad_envs.sensors import sensor_rows
+from quad_envs.sensors import RANGE, reads, sensor_rows
 from quad_envs.tasks import TeamTask
 
 from .decoding import empty_parts, part_starts
@@ -69,6 +69,11 @@ class TargetEstimator:
         prior = Restart(task.prior_velocity, (position,) * 3 + (velocity,) * 3)
         data = FilterData(self.q, task.dt, task.layout.comm_size, MAX_RATIO)
         m, rows = 1 + task.layout.neighbours, sensor_rows(task.sensor)
+        if trilaterate and not reads(rows, RANGE):
+            raise ValueError(
+                f"trilateration needs ranges, which the sensor {task.sensor!r} does not read: take "
+                "estimator='ekf', or an environment with sensor='range'"
+            )
         self._starts = part_starts(task.layout)
         self._constants = (
             prior.data(),

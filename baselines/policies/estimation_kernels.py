@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from controllers.estimation.ekf_kernels import NIS_LIMIT, ekf_scratch, ekf_update_kernel, predict_kernel
 from controllers.estimation.kalman import kalman_scratch, kalman_update_kernel
-from controllers.estimation.restart_kernels import begin_anew
+from controllers.estimation.restart_kernels import begin_anew, move_to_lines
 from controllers.estimation.trilateration_kernels import (
     ACCEPTED,
     TRILATERATION_SCRATCH,
@@ -20,6 +20,7 @@ from controllers.team.consensus_kernels import inertial_velocity, turn_to_inerti
 from quad_envs._numba import Int, kernel
 from quad_envs.observations.team import COMM_AGE, N_MEASURED
 from quad_envs.parameters import DRAG_RATE, GRAVITY, INV_MASS, Array
+from quad_envs.sensors import AZIMUTH, RANGE, reads
 
 from .decoding import decode_rows, split_memory
 from .protocol import Actions, Counts
@@ -143,6 +144,31 @@ def _start_at_measurement(
 
 
 @kernel
+def _start_at_lines(
+    z: Array,
+    place: Array,
+    age: Array,
+    valid: NDArray[np.bool_],
+    sigma: Array,
+    x: Array,
+    covariance: Array,
+    scratch: Array,
+) -> bool:
+    """With the first lines of sight that meet, move a vague mean there, as above; whether they did."""
+    kept, rest = scratch[:3], scratch[3:]
+    for a in range(3):
+        kept[a] = x[a]
+    if not move_to_lines(z, place, age, valid, x, rest):
+        return False
+    square = x[0] * x[0] + x[1] * x[1] + x[2] * x[2]  # of the distance from the vehicle
+    spread = (covariance[0, 0] + covariance[1, 1] + covariance[2, 2]) / 3.0
+    if spread <= 2.0 * square * max(sigma[1], sigma[2]):
+        for a in range(3):
+            x[a] = kept[a]
+    return True
+
+
+@kernel
 def _update_by_fix(
     z: Array,
     place: Array,
@@ -220,7 +246,7 @@ def filter_row(
         report: Output, (N_REPORT,).
         prior: `Restart.data` of the task's prior, (9,): how an episode and a lost filter begin.
         sigma: Of range, azimuth, elevation, (3,).
-        rows: 1 or 3.
+        rows: Which of these it reads, see `quad_envs.sensors.sensor_rows`.
         coefficients: QuadrotorParams.coefficients().
         limits: Of a trilateration's residual, see `acceptance_limits`; None: never trilaterate.
         data: The rest.
@@ -240,9 +266,12 @@ def filter_row(
     for a in range(6):
         memory[_VELOCITY + a] = motion[a]
     held = _gather(comm, measured, z, place, age, valid)
-    if memory[STAGE] == 1.0 and held > 0 and rows > 1:
-        _start_at_measurement(z, place, age, valid, sigma, x, covariance)
-        memory[STAGE] = 2.0
+    if memory[STAGE] == 1.0 and held > 0 and reads(rows, AZIMUTH):
+        if reads(rows, RANGE):
+            _start_at_measurement(z, place, age, valid, sigma, x, covariance)
+            memory[STAGE] = 2.0
+        elif _start_at_lines(z, place, age, valid, sigma, x, covariance, rest):
+            memory[STAGE] = 2.0
     report[2], report[3] = float(held), 0.0
     if limits is not None:
         nis, done = _update_by_fix(z, place, age, valid, sigma, limits, data, prior, x, covariance, rest)

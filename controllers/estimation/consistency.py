@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from quad_envs.parameters import Array
-from quad_envs.sensors import N_MEASUREMENT, jacobian
+from quad_envs.sensors import N_MEASUREMENT, first_row, jacobian, row_count
 
 
 def nees(error: ArrayLike, P: ArrayLike) -> Array:
@@ -56,13 +56,14 @@ def information(d: ArrayLike, sigma: ArrayLike, rows: int, held: ArrayLike | Non
     Args:
         d: True r_t - p_j of each measurement, (..., m, 3), m.
         sigma: Standard deviations of range, azimuth, elevation, (3,).
-        rows: 1 or 3, see `quad_envs.sensors.sensor_rows`.
+        rows: Which entries count, see `quad_envs.sensors.sensor_rows`.
         held: Which measurements count, (..., m), bool; None: all.
 
     Returns:
         (..., 6, 6).
     """
-    H = jacobian(d)[..., :rows, :] / np.asarray(sigma, dtype=np.float64)[:rows, None]
+    read = slice(first_row(rows), first_row(rows) + row_count(rows))
+    H = jacobian(d)[..., read, :] / np.asarray(sigma, dtype=np.float64)[read, None]
     if held is not None:
         H = np.where(np.asarray(held, dtype=np.bool_)[..., None, None], H, 0.0)
     out = np.zeros((*H.shape[:-3], 6, 6))

@@ -45,7 +45,7 @@ from numpy.typing import ArrayLike
 from quad_envs._numba import Int, kernel
 from quad_envs.names import shown
 from quad_envs.parameters import Array
-from quad_envs.sensors import N_MEASUREMENT
+from quad_envs.sensors import N_MEASUREMENT, SENSORS, sensor_rows
 
 from .arguments import BoolArray, IntArray, as_floats, as_mask, require_non_negative
 from .ekf_kernels import N_TARGET, ekf_scratch, ekf_update_kernel, predict_kernel
@@ -210,12 +210,12 @@ def update(
 
     Args:
         state: n predicted filters.
-        z: Range, azimuth, elevation, (n, m, 3), m, rad, rad; only the first `rows` are read.
+        z: Range, azimuth, elevation, (n, m, 3), m, rad, rad; only those of `rows` are read.
         position: Where each was made, (n, m, 3), m, in the frame of the state.
         age: How long ago each was made, (n, m), s; None: now.
         valid: Which are there, (n, m), bool; None: all. A vehicle without any keeps its prediction.
         sigma: Standard deviations of z, (3,).
-        rows: 1 (range) or 3, see `quad_envs.sensors.sensor_rows`.
+        rows: Which those are, see `quad_envs.sensors.sensor_rows`: 1 is the range, 3 are all.
         restart: What a lost filter begins anew with; None: it never does, and takes every measurement.
         second_order: Whether ranges without angles count to the second order; the dissertation's do not.
 
@@ -224,8 +224,8 @@ def update(
         makes S indefinite, or that alone contradicts all others is left out and counted as rejected.
 
     Raises:
-        ValueError: If a shape is wrong, a state is not finite, sigma is not positive, or rows is neither 1
-            nor 3.
+        ValueError: If a shape is wrong, a state is not finite, sigma is not positive, or there is no sensor
+            of such rows.
     """
     new = _copied(state)
     n = len(new.x)
@@ -236,8 +236,10 @@ def update(
     noise = as_floats("sigma", sigma, (N_MEASUREMENT,))
     if not (noise > 0.0).all():
         raise ValueError(f"sigma must be three standard deviations > 0 (m, rad, rad), got {noise}")
-    if rows not in (1, N_MEASUREMENT):
-        raise ValueError(f"rows must be 1 (range) or {N_MEASUREMENT} (with both angles), got {shown(rows)}")
+    known = {sensor_rows(name): name for name in SENSORS}
+    if rows not in known:
+        allowed = " or ".join(f"{number} ({name})" for number, name in known.items())
+        raise ValueError(f"rows must be {allowed}, got {shown(rows)}")
     nis, counts = np.empty(n), np.empty((2, n), dtype=np.int64)
     mask, restarted = as_mask("valid", valid, (n, m)), np.empty(n, dtype=np.bool_)
     anew = np.empty(0) if restart is None else restart.data()

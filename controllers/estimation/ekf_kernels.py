@@ -10,18 +10,26 @@ from quad_envs.rotations import wrap_angle_scalar
 from quad_envs.sensors import (
     AZIMUTH,
     ELEVATION,
-    N_MEASUREMENT,
     RANGE,
     direction_rows,
     direction_variances,
+    first_row,
     is_overhead,
     jacobian_rows,
     measure,
+    reads,
+    row_count,
 )
 
 from .arguments import BoolArray
 from .kalman import kalman_scratch, kalman_update_kernel
-from .restart_kernels import RESTART_SCRATCH, restart_at_directions, restart_at_ranges
+from .restart_kernels import (
+    RESTART_SCRATCH,
+    begin_anew,
+    move_to_lines,
+    restart_at_directions,
+    restart_at_ranges,
+)
 
 N_TARGET = 6  # r_t, v_t
 NIS_LIMIT = 50.0  # a row, of all measurements together: a lost filter, or a false measurement
@@ -51,19 +59,18 @@ def predict_kernel(x: Array, P: Array, dt: float, q: float) -> None:
 
 def ekf_scratch(measurements: int, rows: int) -> int:
     """Numbers of scratch that `ekf_step_kernel` needs for that many measurements of that many rows."""
-    M = measurements * rows
+    M = measurements * row_count(rows)
     joint = kalman_scratch(N_TARGET, M) + (N_TARGET + 3 + 9 + M) * M
     return max(joint, RESTART_SCRATCH + 4 * measurements) + 2 * measurements + _STATE
 
 
 @kernel
 def _usable(z: Array, position: Array, age: float, rows: Int) -> bool:
-    """Whether all numbers of a measurement are finite and of this world, and its range is positive."""
-    good = abs(age) < _LARGEST and z[RANGE] > 0.0
+    """Whether all numbers of a measurement are finite and of this world, and a range is positive."""
+    good = abs(age) < _LARGEST and (z[RANGE] > 0.0 or not reads(rows, RANGE))
     for a in range(3):
         good = good and abs(position[a]) < _LARGEST
-    for a in range(rows):
-        good = good and abs(z[a]) < _LARGEST
+        good = good and (abs(z[a]) < _LARGEST or not reads(rows, a))
     return good
 
 
@@ -71,7 +78,7 @@ def _usable(z: Array, position: Array, age: float, rows: Int) -> bool:
 def _linearise(
     x: Array, z: Array, position: Array, age: float, sigma: Array, rows: Int, nu: Array, H: Array, R: Array
 ) -> None:
-    """Rows of one measurement into nu (rows,), H (rows, 6), variances R (rows,).
+    """Rows of one measurement into nu (count,), H (count, 6), variances R (count,).
 
     The target was at r - age v when it was measured. Overhead the rows of the angles hold the direction.
     """
@@ -80,22 +87,25 @@ def _linearise(
     dz = x[2] - age * x[5] - position[2]
     predicted = measure(dx, dy, dz)
     derivatives = jacobian_rows(dx, dy, dz)
-    for a in range(rows):
-        error = z[a] - predicted[a]
-        nu[a] = wrap_angle_scalar(error) if a == AZIMUTH else error
-        R[a] = sigma[a] * sigma[a]
+    first, count = first_row(rows), row_count(rows)
+    for a in range(count):
+        entry = first + a
+        error = z[entry] - predicted[entry]
+        nu[a] = wrap_angle_scalar(error) if entry == AZIMUTH else error
+        R[a] = sigma[entry] * sigma[entry]
         for j in range(3):
-            H[a, j] = derivatives[a][j]
+            H[a, j] = derivatives[entry][j]
     # The direction does not tell above from below. A mirrored prediction is led back by the elevation alone.
-    if rows == N_MEASUREMENT and z[ELEVATION] * dz <= 0.0 and is_overhead(dx, dy, dz, sigma[ELEVATION]):
+    if reads(rows, ELEVATION) and z[ELEVATION] * dz <= 0.0 and is_overhead(dx, dy, dz, sigma[ELEVATION]):
         u, w, along, across = direction_rows(dx, dy, dz, z[AZIMUTH])
-        nu[AZIMUTH], nu[ELEVATION] = -w, math.cos(z[ELEVATION]) - u
-        R[ELEVATION], R[AZIMUTH] = direction_variances(
+        azimuth, elevation = AZIMUTH - first, ELEVATION - first
+        nu[azimuth], nu[elevation] = -w, math.cos(z[ELEVATION]) - u
+        R[elevation], R[azimuth] = direction_variances(
             dx, dy, dz, z[ELEVATION], sigma[AZIMUTH], sigma[ELEVATION]
         )
         for j in range(3):
-            H[AZIMUTH, j], H[ELEVATION, j] = across[j], along[j]
-    for a in range(rows):
+            H[azimuth, j], H[elevation, j] = across[j], along[j]
+    for a in range(count):
         for j in range(3):
             H[a, 3 + j] = -age * H[a, j]
 
@@ -150,8 +160,8 @@ def _joint_update(
 
     A measurement that makes S indefinite is unmarked. With `curved` ranges count to the second order.
     """
-    m = z.shape[0]
-    M = m * rows
+    m, count = z.shape[0], row_count(rows)
+    M = m * count
     nu, variance, owner = scratch[:M], scratch[M : 2 * M], scratch[2 * M : 3 * M]
     bent, scratch = scratch[3 * M : 12 * M].reshape(M, 9), scratch[12 * M :]
     H = scratch[: 6 * M].reshape(M, 6)
@@ -161,7 +171,7 @@ def _joint_update(
         for j in range(m):
             if use[j] != 0.0:
                 _linearise(x, z[j], position[j], age[j], sigma, rows, nu[used:], H[used:], variance[used:])
-                for _ in range(rows):
+                for _ in range(count):
                     owner[used] = j
                     used += 1
         if used == 0:
@@ -170,7 +180,7 @@ def _joint_update(
         for a in range(used):
             for b in range(used):
                 R[a, b] = variance[a] if a == b else 0.0
-        if curved and rows == 1:
+        if curved and not reads(rows, AZIMUTH):
             _add_curvature(x, P, position, age, owner, nu[:used], R, bent)
         nis, failed = kalman_update_kernel(x, P, nu[:used], H[:used], R, scratch)
         if failed < 0:
@@ -244,8 +254,12 @@ def _restart(
     scratch: Array,
 ) -> None:
     """A new filter where the measurements are; those that contradict it even there are unmarked."""
-    if rows == 1:
-        restart_at_ranges(x, P, z, position, age, restart, use, scratch)
+    if not (reads(rows, RANGE) and reads(rows, AZIMUTH)):
+        if reads(rows, RANGE):
+            restart_at_ranges(x, P, z, position, age, restart, use, scratch)
+        else:
+            begin_anew(x, P, restart)
+            move_to_lines(z, position, age, use, x, scratch)
         _joint_update(x, P, z, position, age, sigma, rows, False, use, scratch)
         return
     best = restart_at_directions(x, P, z, position, age, sigma, restart, use)
@@ -292,12 +306,12 @@ def ekf_update_kernel(
         _keep(x, P, kept)
     nis, used = _joint_update(x, P, z, position, age, sigma, rows, curved, use, scratch)
     far = nis > NIS_LIMIT * used
-    lost = watch and (far or (rows > 1 and nis > ALONE_LIMIT * used))
+    lost = watch and (far or (reads(rows, AZIMUTH) and nis > ALONE_LIMIT * used))
     if lost:
         _undo(kept, x, P)
         limit = AGREEMENT if far else ALONE_LIMIT
         outlying = _outliers(x, P, z, position, age, sigma, rows, curved, use, limit, alone, kept, scratch)
-        lost = 2 * outlying * rows >= used or (far and outlying == 0)
+        lost = 2 * outlying * row_count(rows) >= used or (far and outlying == 0)
         if lost:
             _restart(x, P, z, position, age, sigma, rows, restart, use, kept, scratch)
         else:
@@ -334,12 +348,12 @@ def ekf_step_kernel(
         dt: Time since the last step, s.
         q: Density of the target's acceleration, m^2/s^3.
         displacement: Way of the origin since the last step, (3,), m.
-        z: Range, azimuth, elevation, (m, 3), m, rad, rad; the first `rows` count.
+        z: Range, azimuth, elevation, (m, 3), m, rad, rad; of which `rows` count.
         position: Where each was made, (m, 3), m, in the present frame.
         age: How long ago, (m,), s.
         valid: Which of them are there, (m,).
         sigma: Standard deviations of z, (3,).
-        rows: 1 or 3, see `quad_envs.sensors.sensor_rows`.
+        rows: Which entries of z count, see `quad_envs.sensors.sensor_rows`.
         restart: What a lost filter restarts with, see `ekf.Restart`, (9,); (0,): it never does.
         curved: Whether ranges without angles count to the second order.
         scratch: Overwritten, (>= ekf_scratch(m, rows),).

@@ -20,12 +20,12 @@ class Prior(NamedTuple):
 class Measurements(NamedTuple):
     """What the vehicles hold in one step; rows of `z` that are not valid are zero."""
 
-    z: Array  # (n, m, 3), range, azimuth, elevation, m, rad, rad; the first `rows` count
+    z: Array  # (n, m, 3), range, azimuth, elevation, m, rad, rad; those of `rows` count
     position: Array  # (n, m, 3), where each was made, relative to the vehicle's present position, m
     age: Array  # (n, m), how long ago, s
     valid: BoolArray  # (n, m)
     sigma: Array  # (3,), standard deviations of z
-    rows: int  # 1 (range) or 3 (with both angles)
+    rows: int  # which entries of z, `quad_envs.sensors.sensor_rows`: 1 is the range, 3 are all
 
 
 @runtime_checkable

@@ -1,8 +1,9 @@
 """Where a target filter begins anew when its measurements say that it is lost; compiled, without allocation.
 
 A lost filter cannot come back by itself: linearised at the wrong place it takes a small gain for a large
-error, or throws the velocity. So it becomes a new one: with angles a measurement is a position, ranges alone
-give the nearest place that they allow, and the velocity is what is known before anything is measured.
+error, or throws the velocity. So it becomes a new one: with range and angles a measurement is a position,
+ranges alone give the nearest place that they allow, angles alone the place where lines of sight
+meet, and the velocity is what is known before anything is measured.
 """
 
 from __future__ import annotations
@@ -13,10 +14,12 @@ from quad_envs._numba import kernel
 from quad_envs.parameters import Array
 from quad_envs.sensors import AZIMUTH, ELEVATION, RANGE
 
-from .trilateration_kernels import NEAREST_SCRATCH, nearest_point
+from .arguments import BoolArray
+from .trilateration_kernels import NEAREST_SCRATCH, condition_number, nearest_point, solve_definite
 
 RESTART_SCRATCH = NEAREST_SCRATCH + 3  # and 4 per measurement
 _N = 6  # states
+_PARALLEL = 100.0  # condition of A, above which lines meet nowhere in particular: two within 11 degrees
 
 
 @kernel
@@ -79,6 +82,36 @@ def restart_at_directions(
             for k in range(3):
                 P[a, b] += spread[k] ** 2 * axes[k][a] * axes[k][b]
     return best
+
+
+@kernel
+def move_to_lines(
+    z: Array, position: Array, age: Array, use: Array | BoolArray, x: Array, scratch: Array
+) -> bool:
+    """Move the position of x (6,) to where the measured lines of sight meet; False where they fix no place.
+
+    It minimises sum |(I - u u')(r - p)|^2 over the measurements that count, u a line of sight: A r = b with
+    A = sum (I - u u'). A line leaves the distance along itself open, and so do lines that are parallel.
+    """
+    A, b = scratch[:9].reshape(3, 3), scratch[9:12].reshape(3, 1)
+    lines = 0
+    for i in range(12):
+        scratch[i] = 0.0
+    for j in range(use.shape[0]):
+        if use[j] != 0.0:
+            lines += 1
+            ce = math.cos(z[j, ELEVATION])
+            u = (ce * math.cos(z[j, AZIMUTH]), ce * math.sin(z[j, AZIMUTH]), -math.sin(z[j, ELEVATION]))
+            for i in range(3):
+                for k in range(3):
+                    across = (1.0 if i == k else 0.0) - u[i] * u[k]
+                    A[i, k] += across
+                    b[i, 0] += across * (position[j, k] + age[j] * x[3 + k])
+    if lines < 2 or condition_number(A) > _PARALLEL or not solve_definite(A, b):
+        return False
+    for i in range(3):
+        x[i] = b[i, 0]
+    return True
 
 
 @kernel

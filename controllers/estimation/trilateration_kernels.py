@@ -22,7 +22,7 @@ MAX_RATIO = 8.0  # of the largest and smallest singular value of the centred pos
 
 
 @kernel
-def _ratio_squared(C: Array) -> float:
+def condition_number(C: Array) -> float:
     """Ratio of the largest and smallest eigenvalue of a symmetric, positive semidefinite C (3, 3)."""
     mean = (C[0, 0] + C[1, 1] + C[2, 2]) / 3.0
     a, b, c = C[0, 0] - mean, C[1, 1] - mean, C[2, 2] - mean
@@ -61,7 +61,7 @@ def _spread(position: Array, use: Array, centre: Array, C: Array) -> None:
 
 
 @kernel
-def _solve(A: Array, x: Array) -> bool:
+def solve_definite(A: Array, x: Array) -> bool:
     """Solve A y = x in place for A (3, 3), which is destroyed, and x (3, 1); False if A is not definite."""
     if cholesky(A) >= 0:
         return False
@@ -83,7 +83,7 @@ def _linear_start(
                 y += (position[j, a] - centre[a]) ** 2
             for a in range(3):  # the mean of y drops out, since the c_j add up to 0
                 x[a, 0] += 0.5 * (position[j, a] - centre[a]) * y
-    _solve(C, x)
+    solve_definite(C, x)
     for a in range(3):
         r[a] = centre[a] + x[a, 0]
 
@@ -123,7 +123,7 @@ def _levenberg_marquardt(
         added = damping * (JJ[0, 0] + JJ[1, 1] + JJ[2, 2] + 1e-9)  # alike in all directions: fewer than three
         for a in range(3):  # ranges leave some free, in which the step must not grow
             A[a, a] += added
-        if not _solve(A, x):
+        if not solve_definite(A, x):
             break
         length = 0.0
         for a in range(3):
@@ -155,7 +155,7 @@ def nearest_point(position: Array, distance: Array, use: Array, r: Array, scratc
         count += 1 if use[j] != 0.0 else 0
     if count >= MIN_RANGES:
         _spread(position, use, centre, C)
-        if _ratio_squared(C) <= MAX_RATIO * MAX_RATIO:
+        if condition_number(C) <= MAX_RATIO * MAX_RATIO:
             _linear_start(position, distance, use, centre, C, x, r)
     _levenberg_marquardt(position, distance, use, r, trial, x, JJ, C)
 
@@ -220,7 +220,7 @@ def trilaterate_kernel(
     if count < MIN_RANGES:
         return _no_fix(TOO_FEW, r, P)
     _spread(position, use, centre, C)
-    if not _ratio_squared(C) <= max_ratio * max_ratio:
+    if not condition_number(C) <= max_ratio * max_ratio:
         return _no_fix(GEOMETRY, r, P)
     if abs(start[0]) < _LARGEST and abs(start[1]) < _LARGEST and abs(start[2]) < _LARGEST:
         for a in range(3):

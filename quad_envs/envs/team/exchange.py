@@ -17,7 +17,7 @@ from ...observations.team import N_COMM, N_MEASURED, N_PLAN_STAGE, N_SENSED
 from ...observations.tracking import N_REFERENCE, encode_preview
 from ...parameters import Array
 from ...rotations import sincos
-from ...sensors import measure
+from ...sensors import AZIMUTH, RANGE, measure, reads
 from ...tasks import LOSS_PARTS
 from ..tracking.kernel import DT, MOST_VALUES, PREVIEW, ROW_SIZE, STEP, encode_vehicle
 
@@ -56,7 +56,7 @@ HEAD = 3
     WHOLE_TEAM,  # 1: a crash ends the episode of all
     HAS_LEADER,
     ON_RAILS,
-    SENSOR_ROWS,  # 0: no target, 1: range, 3: range-azimuth-elevation
+    SENSOR_ROWS,  # 0: no target, else `sensors.sensor_rows`
     DETECTION,  # probability that a measurement succeeds
     PLAN_STAGES,
     N_VALUES,  # named constraint rows
@@ -124,8 +124,10 @@ def measure_target(
     if measures > 0.0 and draw[3] < team[DETECTION]:
         rho, azimuth, elevation = measure(target[0] - own[0], target[1] - own[1], target[2] - own[2])
         out[0] = 1.0
-        out[1] = rho + team[SIGMA][0] * draw[0]
-        if team[SENSOR_ROWS] > 1.0:
+        rows = int(team[SENSOR_ROWS])
+        if reads(rows, RANGE):
+            out[1] = rho + team[SIGMA][0] * draw[0]
+        if reads(rows, AZIMUTH):
             out[2], out[3] = sincos(azimuth + team[SIGMA][1] * draw[1])
             out[4] = elevation + team[SIGMA][2] * draw[2]
 

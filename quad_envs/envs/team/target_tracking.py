@@ -24,9 +24,9 @@ class TargetTrackingEnv(TeamEnv):
     cannot tell the target from its mirror image.
     Target: `target` "cv", "static", "turn", "aircraft" or a Target, `target_spread` (0, 0): standard
         deviations of its start and of its velocity, m and m/s.
-    Sensor: `sensor` "range-azimuth-elevation" or "range", `sensor_sigma` (0.1 m, 0.02 rad, 0.02 rad),
-        `detection` probability 1, `measuring` "all" or vehicle numbers, `prior_velocity` (0, 0, 0) m/s,
-        `prior_sigma` (3 m, 1 m/s).
+    Sensor: `sensor` "range-azimuth-elevation" or another of `quad_envs.sensors.SENSORS`,
+        `sensor_sigma` (0.1 m, 0.02 rad, 0.02 rad), `detection` probability 1, `measuring` "all" or vehicle
+        numbers, `prior_velocity` (0, 0, 0) m/s, `prior_sigma` (3 m, 1 m/s).
 
     ## References
     G. Ru, Nonlinear Model Predictive Control for Cooperative Control and Estimation, 2017, chapter 7.
