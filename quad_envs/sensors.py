@@ -39,6 +39,7 @@ RANGE, AZIMUTH, ELEVATION = range(N_MEASUREMENT)
 SENSORS = {
     "range": slice(RANGE, AZIMUTH),
     "range-azimuth-elevation": slice(RANGE, N_MEASUREMENT),
+    "azimuth-elevation": slice(AZIMUTH, N_MEASUREMENT),
 }
 MIN_HORIZONTAL_SQUARED = 1e-6  # m^2, smallest s^2 in a division
 OVERHEAD = 8.0  # the angles count where s > OVERHEAD sigma_el rho, the direction elsewhere
