@@ -23,7 +23,10 @@ from .qp.riccati import dare as dare
 from .qp.riccati import lqr_gain as lqr_gain
 from .team.collision import AvoidanceOptions as AvoidanceOptions
 from .team.consensus import ConsensusOptions as ConsensusOptions
-from .team.consensus import TargetEstimate as TargetEstimate
 from .team.consensus import consensus_reference as consensus_reference
 from .team.cooperative import CooperativeDecision as CooperativeDecision
 from .team.cooperative import CooperativeMpc as CooperativeMpc
+from .team.options import CentralOptions as CentralOptions
+from .team.options import CooperativeOptions as CooperativeOptions
+from .team.situation import TargetEstimate as TargetEstimate
+from .team.situation import TeamSituation as TeamSituation

@@ -76,17 +76,18 @@ def hyperparameter_tables() -> str:
 
 
 def controller_options_table() -> str:
-    """What each controller lets choose, in Markdown; of the MPCs, what they share stands first."""
+    """What each controller lets choose, in Markdown; what several MPCs share stands first."""
     from controllers.feedback.options import FeedbackLinearizationOptions, LqrOptions, SdreOptions
     from controllers.mpc.options import LmpcOptions, MpcOptions, NmpcOptions, SdcOptions
+    from controllers.team.options import CentralOptions, CooperativeOptions
     from quad_envs.field_comments import field_comments
 
     lines = []
-    shared = {field.name for field in fields(MpcOptions)}
-    mpcs = (MpcOptions, LmpcOptions, SdcOptions, NmpcOptions)
+    parents = dict.fromkeys((LmpcOptions, SdcOptions, NmpcOptions), MpcOptions)
+    mpcs = (MpcOptions, *parents, CooperativeOptions, CentralOptions)
     for kind in (*mpcs, SdreOptions, LqrOptions, FeedbackLinearizationOptions):
-        own = [f for f in fields(kind) if kind not in mpcs[1:] or f.name not in shared]
-        values = {field.name: field.default for field in own}
+        shared = {field.name for field in fields(parents[kind])} if kind in parents else ()
+        values = {field.name: field.default for field in fields(kind) if field.name not in shared}
         lines += [f"#### {kind.__name__}", "", *_rows("option", values, field_comments(kind)), ""]
     return "\n".join(lines)
 

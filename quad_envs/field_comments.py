@@ -20,6 +20,8 @@ Returned = TypeVar("Returned")
 def field_comments(kind: type[Any]) -> dict[str, str]:
     """The comment behind each field of a dataclass, or on its further lines, inherited ones included.
 
+    A field that is declared again without one, for another default, keeps the comment that it inherits.
+
     Args:
         kind: A dataclass.
 
@@ -28,7 +30,7 @@ def field_comments(kind: type[Any]) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     for parent in reversed(kind.__mro__[:-1]):
-        found |= _own_comments(parent)
+        found |= {name: comment for name, comment in _own_comments(parent).items() if comment}
     return {entry.name: found.get(entry.name, "") for entry in fields(kind)}
 
 

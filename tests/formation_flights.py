@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from controllers import TeamSituation
 from quad_envs.dynamics import simulate
 from quad_envs.formations import make_formation, start_positions
 from quad_envs.graphs import make_graph, toward_leader
@@ -126,16 +127,13 @@ def fly_team(controller, start, slots, G, path, seconds=20.0):
     task = controller.task
     plants, n = at_rest(start, task), len(start)
     last, leader = np.full((n, 4), task.hover_force), np.arange(n) == 0
-    memory, disturbance = np.zeros((n, controller.memory_size)), np.zeros((n, 6))
+    memory = np.zeros((n, controller.memory_size))
     preview, plans = np.zeros((n, task.layout.preview + 1, 8)), None
     history, fallbacks, iterations = [plants], [], []
     for k in range(round(seconds / DT)):
         preview[0] = preview_rows(plants[0], path, k, task.layout.preview + 1)
         comm, sensed = messages(plants, G, slots, task, plans), sensed_rows(plants, task)
-        target = None, None, None, None
-        decision = controller.decide(
-            plants, last, leader, preview, comm, sensed, *target, disturbance, memory
-        )
+        decision = controller.decide(TeamSituation(plants, last, comm, sensed, leader, preview), memory)
         last, memory = decision.command, decision.memory
         plans = decision.plan + np.pad(plants[:, None, :3], ((0, 0), (0, 0), (0, 3)))
         plants = simulate(plants, last, task.params)
@@ -162,7 +160,7 @@ def swap_antipodes(controller, speed, vehicles=2, seed=0, jitter=0.05):
     start, goal = ring + jitter * rng.normal(size=ring.shape), -ring
     length = np.linalg.norm(goal - start, axis=1)
     plants, last = at_rest(start, task), np.full((vehicles, 4), task.hover_force)
-    memory, zero = np.zeros((vehicles, controller.memory_size)), np.zeros((vehicles, 6))
+    memory, leader = np.zeros((vehicles, controller.memory_size)), np.ones(vehicles, bool)
     comm = np.zeros((vehicles, task.layout.neighbours, task.layout.comm_size))
     stages, gap, plans = task.layout.preview + 1, np.inf, None
     G = np.ones((vehicles, vehicles))
@@ -178,10 +176,8 @@ def swap_antipodes(controller, speed, vehicles=2, seed=0, jitter=0.05):
             preview[i] = preview_rows(plants[i], path, k, stages)
         if task.layout.neighbours:
             comm = messages(plants, G, start, task, plans)
-        decision = controller.decide(
-            plants, last, np.ones(vehicles, bool), preview, comm, sensed_rows(plants, task), None, None, None,
-            None, zero, memory,
-        )  # fmt: skip
+        situation = TeamSituation(plants, last, comm, sensed_rows(plants, task), leader, preview)
+        decision = controller.decide(situation, memory)
         last, memory = decision.command, decision.memory
         plans = decision.plan + np.pad(plants[:, None, :3], ((0, 0), (0, 0), (0, 3)))
         plants = simulate(plants, last, task.params)
@@ -189,22 +185,18 @@ def swap_antipodes(controller, speed, vehicles=2, seed=0, jitter=0.05):
     return Meeting(gap, np.linalg.norm(plants[:, :3] - goal, axis=1).max())
 
 
-def decide(controller, plants, G, slots, memory=None, path=still, target=(None,) * 4, **changed):
-    """One decision of a team from its true states; `changed` replaces arguments by name."""
-    names = ("plant", "last_command", "leader", "preview", "comm", "sensed", "disturbance", "memory")
-    values = arguments(controller, plants, G, slots, memory, path)
-    named = {**dict(zip(names, values, strict=True)), **changed}
-    before, after = [named[name] for name in names[:6]], [named[name] for name in names[6:]]
-    return controller.decide(*before, *target, *after)
+def decide(controller, plants, G, slots, memory=None, path=still, target=None, **changed):
+    """One decision of a team from its true states; `changed` replaces parts of the situation by name."""
+    situation, kept = situation_of(controller, plants, G, slots, path), changed.pop("memory", memory)
+    kept = np.zeros((len(plants), controller.memory_size)) if kept is None else kept
+    return controller.decide(situation._replace(target=target, **changed), kept)
 
 
-def arguments(controller, plants, G, slots, memory=None, path=still):
-    """What `decide` takes, without the target estimate."""
+def situation_of(controller, plants, G, slots, path=still):
+    """What `decide` takes besides the memory, without the target estimate."""
     task, n = controller.task, len(plants)
     preview = np.zeros((n, task.layout.preview + 1, 8))
     preview[0] = preview_rows(plants[0], path, 0, task.layout.preview + 1)
-    memory = np.zeros((n, controller.memory_size)) if memory is None else memory
-    return (
-        plants, np.full((n, 4), task.hover_force), np.arange(n) == 0, preview,
-        messages(plants, G, slots, task), sensed_rows(plants, task), np.zeros((n, 6)), memory,
-    )  # fmt: skip
+    comm, sensed = messages(plants, G, slots, task), sensed_rows(plants, task)
+    last, leader = np.full((n, 4), task.hover_force), np.arange(n) == 0
+    return TeamSituation(plants, last, comm, sensed, leader, preview, None, np.zeros((n, 6)))

@@ -114,7 +114,7 @@ def test_both_solvers_have_the_box_of_each_rotor(solver):
 
 def test_the_central_mpc_of_a_team_keeps_to_the_limit_of_each_rotor():
     task = TeamTask(vehicles=2, slots=((0.0, 0.0, 0.0), (2.0, 0.0, 0.0)), limits=Limits(kappa=UNEVEN))
-    mpc = CentralMpc(task, 5)
+    mpc = CentralMpc(task, horizon=5)
     plants = np.zeros((2, 16))
     plants[:, :3], plants[:, 12:] = [[0, 0, 6.0], [2, 0, 6.0]], 1.96
     rows = np.zeros((6, 8))

@@ -134,7 +134,7 @@ def test_bad_arguments_are_named():
     for options, message in (
         ({"horizon": 0}, "horizon must be"),
         ({"alpha": -1.0}, "alpha must lie"),
-        ({"braking_time": -1.0}, "braking_time must be >= 0"),
+        ({"braking_time": -1.0}, "braking_time must be finite and >= 0 s"),
         ({"eps": 0.0}, "eps must be > 0"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -27,12 +27,13 @@ class Rows:
     """The rows of one vehicle, evaluated on inertial predictions."""
 
     def __init__(self, options, plant, v, comm=NOBODY, sensed=NOBODY[:, :7], own=NO_PLAN, D=NO_TURN):
-        slots = len(comm) if options.neighbours == "edges" else len(sensed)
-        layout = options.layout(slots, N)
+        slots = len(comm) if options.avoidance_set == "edges" else len(sensed)
+        layout = options.separation_layout(slots, N)
         self.normals, self.lower = np.zeros_like(layout.normals), layout.lower.copy()
         arguments = np.ascontiguousarray(comm), np.ascontiguousarray(sensed), own, N
+        data = options.avoidance_data(D_S, R_S, DT)
         self.used = separation_rows(
-            plant, v, *arguments, options.data(D_S, R_S, DT), D, self.normals, self.lower, np.zeros(6),
+            plant, v, *arguments, data, D, self.normals, self.lower, np.zeros(6),
             np.zeros(COLLISION_SCRATCH),
         )  # fmt: skip
         self.normal, self.stage = layout.normal, layout.stage
@@ -58,7 +59,7 @@ def test_rows_are_those_of_the_equations(moving, braking):
     task, plants = some_team(rng)
     v, sensed = velocities(plants), sensed_rows(plants, task)
     rows, (p, w) = Rows(options, plants[0], v[0], sensed=sensed[0]), predictions(rng)
-    expected, swirl, kept = [], math.radians(5), (D_S + options.margin) / 2
+    expected, swirl, kept = [], math.radians(5), (D_S + options.separation_margin) / 2
     turn = np.array([[np.cos(swirl), -np.sin(swirl), 0], [np.sin(swirl), np.cos(swirl), 0], [0, 0, 1]])
     for row in sensed[0][: rows.used]:
         p_j, v_j = row[1:4], row[4:7] + v[0]
@@ -87,7 +88,9 @@ def test_the_rows_of_a_pair_add_up_to_the_separation():
         apart = (plans[0][0] + plants[0, :3]) - (plans[1][0] + plants[1, :3])
         closing = plans[0][1][N] - plans[1][1][N]
         expected = (
-            np.append(apart[1:] @ a, a @ (apart[N] + options.braking_time * closing)) - D_S - options.margin
+            np.append(apart[1:] @ a, a @ (apart[N] + options.braking * closing))
+            - D_S
+            - options.separation_margin
         )
         np.testing.assert_allclose(slack, expected, atol=1e-12)
 
@@ -130,13 +133,13 @@ def test_edges_give_rows_for_those_it_hears_within_the_radius():
     plants[3, :3] = plants[0, :3] + 3.0
     v, sensed = velocities(plants), sensed_rows(plants, task)
     comm = messages(plants, np.ones((4, 4)), np.zeros((4, 3)), task)[0]
-    heard = Rows(AvoidanceOptions(neighbours="edges"), plants[0], v[0], comm=comm, sensed=sensed[0])
+    heard = Rows(AvoidanceOptions(avoidance_set="edges"), plants[0], v[0], comm=comm, sensed=sensed[0])
     assert heard.used == 2
     same = Rows(AvoidanceOptions(), plants[0], v[0], sensed=sensed[0])
     np.testing.assert_allclose(np.sort(heard.lower[:12]), np.sort(same.lower[:12]), atol=1e-12)
     old = comm.copy()  # sent 0.3 s ago by vehicles of constant velocity
     old[:, 1], old[:, 2:5] = 0.3, comm[:, 2:5] - 0.3 * (comm[:, 5:8] + v[0])
-    late = Rows(AvoidanceOptions(neighbours="edges"), plants[0], v[0], comm=old)
+    late = Rows(AvoidanceOptions(avoidance_set="edges"), plants[0], v[0], comm=old)
     np.testing.assert_allclose(late.lower[:12], heard.lower[:12], atol=1e-12)
 
 
@@ -155,19 +158,27 @@ def test_nobody_and_no_rule_make_no_rows():
     assert Rows(AvoidanceOptions(), plants[0], np.zeros(3)).used == 0
     empty = Rows(AvoidanceOptions(), plants[0], np.zeros(3), sensed=np.zeros((4, 7)))
     assert empty.used == 0
-    assert len(AvoidanceOptions("none").layout(4, N).normal) == 0
+    assert len(AvoidanceOptions("none").separation_layout(4, N).normal) == 0
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"rule": "hard"}, "avoidance must be one of 'reciprocal', 'frozen', 'plan', 'none', got 'hard'"),
-        ({"neighbours": "all"}, "avoidance set must be one of 'sensed', 'edges'"),
+        (
+            {"avoidance": "hard"},
+            "avoidance must be one of 'reciprocal', 'frozen', 'plan', 'none', got 'hard'",
+        ),
+        ({"avoidance_set": "all"}, "avoidance_set must be one of 'sensed', 'edges'"),
         ({"braking_time": -0.1}, "braking_time must be finite and >= 0 s"),
         ({"swirl": 2.0}, "swirl must lie in"),
-        ({"weight": 0.0}, "weight of separation must be > 0"),
+        ({"separation_weight": 0.0}, "separation_weight must be > 0"),
     ],
 )
 def test_an_option_that_is_not_allowed_is_named(options, message):
     with pytest.raises(ValueError, match=message):
         AvoidanceOptions(**options)
+
+
+def test_an_option_by_its_name_of_before_is_refused_with_that_of_today():
+    with pytest.raises(TypeError, match="AvoidanceOptions calls weight now separation_weight"):
+        AvoidanceOptions(weight=1.0)

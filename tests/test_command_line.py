@@ -239,7 +239,9 @@ def test_list_shows_the_options_of_a_name(capsys, name, option):
     assert option in json.loads(capsys.readouterr().out)
 
 
-@pytest.mark.parametrize("name", ["lmpc", "sdc-nmpc", "nmpc", "sdre", "lqr", "feedback-linearization"])
+@pytest.mark.parametrize(
+    "name", [name for name in (*TRACKING_POLICIES, *TEAM_POLICIES) if policy_comments(name)]
+)
 def test_list_shows_what_each_option_of_a_controller_means(capsys, name):
     assert main(["list", name]) == 0
     printed = capsys.readouterr().out.splitlines()[1:]

@@ -20,6 +20,7 @@ from formation_flights import (
     velocities,
 )
 
+from controllers import CooperativeOptions, TeamSituation
 from controllers.fallback import Fallback
 from controllers.qp import StructuredSolver, residuals
 from controllers.qp.ocp import condense
@@ -47,13 +48,15 @@ def crowd(seed, n=6, spread=0.6):
     return plants
 
 
-def arguments(task, plants, memory):
+def situation_of(task, plants):
     n = len(plants)
-    return (
-        plants, np.full((n, 4), task.hover_force), np.arange(n) == 0, np.zeros((n, 6, 8)),
-        messages(plants, np.ones((n, n)), TRIANGLE, task), sensed_rows(plants, task), None, None, None, None,
-        np.zeros((n, 6)), memory,
-    )  # fmt: skip
+    comm, sensed = messages(plants, np.ones((n, n)), TRIANGLE, task), sensed_rows(plants, task)
+    return TeamSituation(plants, np.full((n, 4), task.hover_force), comm, sensed, np.arange(n) == 0)
+
+
+def some_rows(situation, which):
+    """The situation of some vehicles, in another order."""
+    return TeamSituation._make(None if part is None else np.asarray(part)[which] for part in situation)
 
 
 def solve_dense(qp):
@@ -78,9 +81,9 @@ def solve_dense(qp):
 def test_a_decision_solves_its_problem_as_other_solvers_do(mpc):
     exact, active = StructuredSolver(), 0
     for seed in range(4):
-        team = arguments(mpc.task, crowd(seed), np.zeros((6, mpc.memory_size)))
-        decision = mpc.decide(*team)
-        for i, qp in enumerate(mpc.problems(*team)):
+        team, memory = situation_of(mpc.task, crowd(seed)), np.zeros((6, mpc.memory_size))
+        decision = mpc.decide(team, memory)
+        for i, qp in enumerate(mpc.problems(team, memory)):
             plan = decision.memory[i, 1 : 1 + 4 * N].reshape(N, 4) - mpc.task.hover_force
             solution = exact.solve(qp)
             assert max(residuals(qp, solution)) < 1e-9  # as in the tests of the solver
@@ -98,45 +101,44 @@ def test_only_the_rows_of_sensed_vehicles_go_to_the_solver(mpc):
     near = alone.copy()
     near[1, :3] = near[0, :3] + [1.0, 0.0, 0.0]
     memory = np.zeros((6, mpc.memory_size))
-    counts = [len(qp.rows.normal) for qp in mpc.problems(*arguments(mpc.task, alone, memory))]
+    counts = [len(qp.rows.normal) for qp in mpc.problems(situation_of(mpc.task, alone), memory)]
     assert counts == [2 * N] * 6
-    counts = [len(qp.rows.normal) for qp in mpc.problems(*arguments(mpc.task, near, memory))]
+    counts = [len(qp.rows.normal) for qp in mpc.problems(situation_of(mpc.task, near), memory)]
     assert counts == [3 * N + 1] * 2 + [2 * N] * 4
 
 
 def test_permuted_vehicles_decide_as_before(mpc):
     plants, order = crowd(5), np.array([3, 0, 5, 1, 4, 2])
-    team = arguments(mpc.task, plants, np.zeros((6, mpc.memory_size)))
-    before = mpc.decide(*team)
-    permuted = mpc.decide(*(None if part is None else np.asarray(part)[order] for part in team))
+    team, memory = situation_of(mpc.task, plants), np.zeros((6, mpc.memory_size))
+    before = mpc.decide(team, memory)
+    permuted = mpc.decide(some_rows(team, order), memory)
     for field in ("command", "memory", "plan", "iterations"):
         np.testing.assert_array_equal(getattr(permuted, field), getattr(before, field)[order])
 
 
 def test_permuted_slots_leave_the_decision_as_it_is(mpc):
-    team = list(arguments(mpc.task, crowd(6), np.zeros((6, mpc.memory_size))))
-    before = mpc.decide(*team)
+    team, memory = situation_of(mpc.task, crowd(6)), np.zeros((6, mpc.memory_size))
+    before = mpc.decide(team, memory)
     order = np.array([2, 4, 0, 3, 1])
-    team[4], team[5] = team[4][:, order], team[5][:, order]
-    after = mpc.decide(*team)
+    after = mpc.decide(team._replace(comm=team.comm[:, order], sensed=team.sensed[:, order]), memory)
     # The active set is found in another order: round-off of its steps.
     np.testing.assert_allclose(after.command, before.command, atol=1e-8)
 
 
 def test_gaps_among_the_sensed_slots_are_skipped():
     wide, narrow = CooperativeMpc(team_task(sensed=8)), CooperativeMpc(team_task(sensed=5))
-    packed = list(arguments(narrow.task, crowd(7), np.zeros((6, narrow.memory_size))))
-    sparse = packed.copy()
-    sparse[5] = np.zeros((6, 8, 7))
-    sparse[5][:, [0, 2, 3, 5, 7]] = packed[5]
-    np.testing.assert_array_equal(wide.decide(*sparse).command, narrow.decide(*packed).command)
+    packed, memory = situation_of(narrow.task, crowd(7)), np.zeros((6, narrow.memory_size))
+    sensed = np.zeros((6, 8, 7))
+    sensed[:, [0, 2, 3, 5, 7]] = packed.sensed
+    sparse = packed._replace(sensed=sensed)
+    np.testing.assert_array_equal(wide.decide(sparse, memory).command, narrow.decide(packed, memory).command)
 
 
 def test_one_call_for_a_team_is_one_call_for_each(mpc):
-    team = arguments(mpc.task, crowd(8), np.zeros((6, mpc.memory_size)))
-    together = mpc.decide(*team)
+    team, memory = situation_of(mpc.task, crowd(8)), np.zeros((6, mpc.memory_size))
+    together = mpc.decide(team, memory)
     for i in range(6):
-        alone = mpc.decide(*(None if part is None else np.asarray(part)[i : i + 1] for part in team))
+        alone = mpc.decide(some_rows(team, [i]), memory[:1])
         np.testing.assert_array_equal(alone.command[0], together.command[i])
 
 
@@ -233,6 +235,45 @@ def test_a_number_that_is_not_finite_is_named(mpc, name):
         decide(mpc, plants, WEAK_TRIANGLE, TRIANGLE, **{name: bad})
 
 
+def test_what_a_vehicle_may_lack_counts_as_nothing(mpc):
+    team, memory = situation_of(mpc.task, crowd(12)), np.zeros((6, mpc.memory_size))
+    zeros = team._replace(preview=np.zeros((6, 6, 8)), disturbance=np.zeros((6, 6)))
+    np.testing.assert_array_equal(mpc.decide(team, memory).command, mpc.decide(zeros, memory).command)
+
+
+def test_the_parts_of_a_situation_one_by_one_are_refused_with_the_form_of_today(mpc):
+    team, memory = situation_of(mpc.task, crowd(12)), np.zeros((6, mpc.memory_size))
+    with pytest.raises(TypeError, match=r"decide\(TeamSituation\(plant=..., last_command=.*, memory\)"):
+        mpc.decide(*team, memory)
+
+
+def test_options_are_a_value_or_keywords(mpc):
+    options = CooperativeOptions(horizon=4, reach=2.0)
+    assert CooperativeMpc(mpc.task, options).options == CooperativeMpc(mpc.task, horizon=4, reach=2.0).options
+    assert CooperativeMpc(mpc.task, options, horizon=3).horizon == 3
+    with pytest.raises(TypeError, match=r"unknown field of CooperativeOptions: 'horizn'.*'horizon'"):
+        CooperativeMpc(mpc.task, horizn=4)
+    with pytest.raises(
+        TypeError, match="options must be CooperativeOptions, got 4; single ones are keywords"
+    ):
+        CooperativeMpc(mpc.task, 4)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"Q": 2.0}, {"R": 0.5}, {"terminal": 3.0}, {"R_rate": 1.0}],
+    ids=lambda options: next(iter(options)),
+)
+def test_the_weights_of_a_team_may_be_chosen_and_are_those_of_its_problem(mpc, options):
+    weighted, exact = CooperativeMpc(mpc.task, **options), StructuredSolver()
+    team, memory = situation_of(mpc.task, crowd(13)), np.zeros((6, mpc.memory_size))
+    decision = weighted.decide(team, memory)
+    assert np.abs(decision.command - mpc.decide(team, memory).command).max() > 1e-3
+    for i, qp in enumerate(weighted.problems(team, memory)):
+        plan = decision.memory[i, 1 : 1 + 4 * N].reshape(N, 4) - mpc.task.hover_force
+        np.testing.assert_allclose(plan, exact.solve(qp).u, atol=1e-9)
+
+
 def test_wrong_shapes_are_named(mpc):
     plants = at_rest(LINE_START, mpc.task)
     with pytest.raises(ValueError, match=r"comm must have shape \(6, 5, 15\) .*, got \(6, 4, 15\)"):
@@ -255,6 +296,7 @@ def test_wrong_shapes_are_named(mpc):
         ({"avoidance": "hard"}, "avoidance must be one of"),
         ({"avoidance": "plan"}, "avoidance='plan' needs plans in the messages"),
         ({"margin": 2.0}, "margin 2.0 leaves nothing"),
+        ({"terminal": 2.0, "terminal_weight": "stage"}, "leave terminal out"),
     ],
 )
 def test_an_option_that_is_not_allowed_is_named(options, message):

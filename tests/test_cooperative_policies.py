@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -21,6 +20,7 @@ from baselines.policies.registry import (
     serving,
 )
 from controllers.team.cooperative import CooperativeMpc
+from controllers.team.situation import TeamSituation
 from quad_envs import cooperative_estimation_v0, formation_v0, target_tracking_v0
 from quad_envs.constraints import actions_from_forces
 from quad_envs.graphs import make_graph
@@ -147,10 +147,8 @@ def test_float32_observations_give_the_actions_of_float64_states():
         preview = np.zeros((n, task.layout.preview + 1, 8))
         preview[0] = preview_rows(plants[0], path, k, task.layout.preview + 1)
         comm = messages(plants, batch.graph(k), batch.slots, task)
-        decision = controller.decide(
-            plants, last, np.arange(n) == 0, preview, comm, sensed_rows(plants, task), None, None, None, None,
-            np.zeros((n, 6)), memory,
-        )  # fmt: skip
+        situation = TeamSituation(plants, last, comm, sensed_rows(plants, task), np.arange(n) == 0, preview)
+        decision = controller.decide(situation, memory)
         memory, last = decision.memory, decision.command
         actions, state = policy.predict(rows_of(seen), state)
         wanted = actions_from_forces(decision.command, task.hover_force, task.force_max)
@@ -260,15 +258,6 @@ def test_options_of_every_policy_are_known():
     for name in TEAM_POLICIES:
         assert isinstance(policy_options(name), dict)
     assert policy_options("consensus-mpc")["horizon"] == 5
-
-
-@pytest.mark.parametrize(
-    ("name", "own"), [("consensus-mpc", {}), ("cooperative-mpc", {"reach", "q", "estimates", "estimator"})]
-)
-def test_the_options_of_a_policy_have_the_defaults_of_its_controller(name, own):
-    of_controller = inspect.signature(CooperativeMpc).parameters
-    for option, default in policy_options(name).items():
-        assert option in own or default == of_controller[option].default
 
 
 def test_a_mission_is_that_of_the_task():

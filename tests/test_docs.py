@@ -20,8 +20,9 @@ from baselines.__main__ import main, make_parser
 from baselines.report.benchmark import BenchmarkRequest
 from baselines.training.algorithms import ALGORITHMS
 from baselines.training.request import TrainingRequest
-from controllers import LmpcOptions, NmpcOptions, SdcOptions
+from controllers import CooperativeOptions, LmpcOptions, NmpcOptions, SdcOptions
 from controllers.feedback.options import FeedbackLinearizationOptions, LqrOptions, SdreOptions
+from controllers.team.options import CentralOptions
 from quad_envs.field_comments import field_comments
 from quad_envs.registration import TEAMS, TRACKING
 
@@ -200,7 +201,7 @@ LAWS = (SdreOptions, LqrOptions, FeedbackLinearizationOptions)
 def test_the_page_on_controllers_gets_every_option_with_its_meaning():
     page = ROOT / "docs" / "api" / "controllers.md"
     text = script("hooks").on_page_markdown(page.read_text(encoding="utf-8"))
-    for kind in (LmpcOptions, SdcOptions, NmpcOptions, *LAWS):
+    for kind in (LmpcOptions, SdcOptions, NmpcOptions, CooperativeOptions, CentralOptions, *LAWS):
         for field, comment in field_comments(kind).items():
             rows = [line for line in text.splitlines() if line.startswith(f"| `{field}` |")]
             assert comment and any(line.endswith(f"| {comment} |") and line.count("|") == 4 for line in rows)

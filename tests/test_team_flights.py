@@ -29,6 +29,7 @@ from formation_flights import (
 
 from baselines import make_policy
 from controllers.team.cooperative import CooperativeMpc
+from controllers.team.situation import TargetEstimate, TeamSituation
 from quad_envs import formation_v0
 from quad_envs.dynamics import simulate
 from quad_envs.formations import make_formation, start_positions
@@ -160,17 +161,15 @@ def fly_to_target(controller, variance, blind=()):
     task, G = controller.task, make_graph("case-1", None, 6)
     start = np.array([[0.0, y, 0.0] for y in np.arange(6) - 2.5])
     plants, last, memory = at_rest(start, task), np.full((6, 4), 1.96), np.zeros((6, controller.memory_size))
-    error, zero = [], np.zeros((6, 6))
-    P = np.tile(variance * np.eye(3), (6, 1, 1))
+    error, P = [], np.tile(variance * np.eye(3), (6, 1, 1))
     for k in range(500):
         r, v = turn(DT * k)
         estimate = np.tile(r, (6, 1))
         for i in blind:
             estimate[i], P[i] = r + 5.0, 1e4 * np.eye(3)
-        decision = controller.decide(
-            plants, last, np.zeros(6), np.zeros((6, 6, 8)), messages(plants, G, slots, task),
-            sensed_rows(plants, task), estimate - plants[:, :3], np.tile(v, (6, 1)), P, slots, zero, memory,
-        )  # fmt: skip
+        target = TargetEstimate(estimate - plants[:, :3], np.tile(v, (6, 1)), P, slots)
+        comm, sensed = messages(plants, G, slots, task), sensed_rows(plants, task)
+        decision = controller.decide(TeamSituation(plants, last, comm, sensed, target=target), memory)
         last, memory = decision.command, decision.memory
         plants = simulate(plants, last, task.params)
         error.append(np.linalg.norm(plants[:, :3] - turn(DT * (k + 1))[0] - slots, axis=1))
@@ -242,10 +241,10 @@ def test_an_estimated_disturbance_is_rejected():
         for _ in range(200):
             preview = np.zeros((1, 6, 8))
             preview[..., :3], preview[..., 7] = -plants[:, None, :3], 1.0
-            decision = controller.decide(
-                plants, last, np.ones(1), preview, np.zeros((1, 0, 15)), np.zeros((1, 0, 7)), None, None,
-                None, None, np.zeros((1, 6)), memory,
-            )  # fmt: skip
+            situation = TeamSituation(
+                plants, last, np.zeros((1, 0, 15)), np.zeros((1, 0, 7)), np.ones(1), preview
+            )
+            decision = controller.decide(situation, memory)
             last, memory = decision.command, decision.memory
             plants = simulate(plants, last, heavy, force_max=task.force_max)
         sags.append(abs(plants[0, 2]))

@@ -78,10 +78,10 @@ def test_a_climbing_vehicle_that_rolls_plans_to_go_where_its_thrust_pushes_it():
 
 
 def test_the_braking_row_reaches_as_far_as_it_takes_to_stop():
-    assert time_to_stop(2.0) == AvoidanceOptions().braking_time == 0.5
+    assert time_to_stop(2.0) == AvoidanceOptions().braking == 0.5
     assert time_to_stop(np.inf) == 0.5 and time_to_stop(4.0) == 1.0
     env = target_tracking_v0.parallel_env()
-    assert make_policy("cooperative-mpc", env, speed=4.0).controller.avoidance.braking_time == 1.0
+    assert make_policy("cooperative-mpc", env, speed=4.0).controller.options.braking == 1.0
 
 
 @pytest.mark.parametrize(

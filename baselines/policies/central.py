@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from controllers.controller import Decision
 from controllers.team.central import CentralMpc
+from controllers.team.options import CentralOptions
 from quad_envs.constraints import actions_from_forces
 from quad_envs.names import shown
 from quad_envs.observations.tracking import N_REFERENCE
@@ -29,43 +29,21 @@ class CentralMpcPolicy:
 
     Args:
         task: Of the mission "formation" or "target-tracking".
-        horizon: See `CentralMpc`, as the rest.
-        alpha: See there.
-        braking_time: See there.
-        swirl: See there.
-        separation_weight: See there.
-        soft_weight: See there.
-        margin: See there.
-        eps: See there.
-        max_iter: See there.
+        options: See `CentralOptions`; None for the defaults.
+        changes: Fields of it, such as horizon=10, which replace those of `options`.
 
     Raises:
+        TypeError: If there is no such option.
         ValueError: If an option is not allowed, there are over 15 vehicles, or the task has no slots.
     """
 
     privileged = True
     name = "central-mpc"
 
-    def __init__(
-        self,
-        task: TeamTask,
-        horizon: int = 5,
-        alpha: float = 1.0,
-        *,
-        braking_time: float = 0.25,
-        swirl: float = math.radians(5.0),
-        separation_weight: float = 1e4,
-        soft_weight: float = 1e3,
-        margin: float = 0.02,
-        eps: float = 1e-6,
-        max_iter: int = 20000,
-    ) -> None:
-        self.task = task
-        self.controller = CentralMpc(
-            task, horizon, alpha, braking_time=braking_time, swirl=swirl,
-            separation_weight=separation_weight, soft_weight=soft_weight, margin=margin, eps=eps,
-            max_iter=max_iter,
-        )  # fmt: skip
+    options_type = CentralOptions
+
+    def __init__(self, task: TeamTask, options: CentralOptions | None = None, **changes: Any) -> None:
+        self.task, self.controller = task, CentralMpc(task, options, **changes)
         self._slots = np.array(task.slots, dtype=np.float64)
         if self._slots.shape != (task.vehicles, 3):
             raise ValueError(f"central-mpc needs task.slots, one of each vehicle, got {shown(task.slots)}")

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import math
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
 
-from controllers.qp.structured import ITERATION_LIMIT
-from controllers.team.collision import AvoidanceRule, AvoidanceSet
-from controllers.team.consensus import Neighbour, TargetModel
-from controllers.team.cooperative import CooperativeDecision, CooperativeMpc, CooperativeTerminalWeight
+from controllers.mpc.options import chosen, shared
+from controllers.team.cooperative import CooperativeDecision, CooperativeMpc
+from controllers.team.options import CooperativeOptions, FormationMpcOptions
+from controllers.team.situation import TargetEstimate, TeamSituation
 from quad_envs.names import unknown_name
 from quad_envs.observations.team import N_SENSED
 from quad_envs.observations.tracking import N_REFERENCE
@@ -61,20 +61,20 @@ class CooperativePolicy(TeamPolicy):
     def _control(self, parts: Decoded, estimates: Estimates | None, memory: Array) -> CooperativeDecision:
         """The controller's decision."""
         n, layout = len(parts.plant), self.task.layout
-        return self.controller.decide(
+        believed = None
+        if estimates is not None:
+            believed = TargetEstimate(estimates.r, estimates.v, estimates.P[:, :3, :3], parts.slot)
+        situation = TeamSituation(
             parts.plant,
             parts.last_command,
-            parts.leader[:, 0],
-            parts.preview.reshape(n, layout.preview + 1, N_REFERENCE),
             parts.comm.reshape(n, layout.neighbours, layout.comm_size),
             parts.sensed.reshape(n, layout.sensed, N_SENSED),
-            estimates.r if estimates is not None else None,
-            estimates.v if estimates is not None else None,
-            estimates.P[:, :3, :3] if estimates is not None else None,
-            parts.slot if estimates is not None else None,
+            parts.leader[:, 0],
+            parts.preview.reshape(n, layout.preview + 1, N_REFERENCE),
+            believed,
             parts.disturbance,
-            memory,
         )
+        return self.controller.decide(situation, memory)
 
     def _act(
         self,
@@ -119,74 +119,23 @@ class ConsensusMpc(CooperativePolicy):
 
     Args:
         task: Of the mission "formation".
-        horizon: See `controllers.team.cooperative.CooperativeMpc`, as all others.
-        alpha: See there.
-        terminal_weight: See there.
-        neighbour: See there.
-        feed_forward: See there.
-        attitude: See there.
-        reach: See there.
-        speed: See there.
-        avoidance: See there.
-        avoidance_set: See there.
-        moving_centre: See there.
-        braking_time: See there.
-        swirl: See there.
-        separation_weight: See there.
-        separation_margin: See there.
-        plan_tilt: See there.
-        turning: See there.
-        soft_weight: See there.
-        margin: See there.
-        reject_disturbance: See there.
-        estimator_gain: See there.
-        iteration_limit: See there.
+        options: See `FormationMpcOptions`; None for the defaults.
+        changes: Fields of it, such as horizon=10, which replace those of `options`.
 
     Raises:
+        TypeError: If there is no such option.
         ValueError: If the task has a target, or an option is not allowed.
     """
 
-    def __init__(
-        self,
-        task: TeamTask,
-        horizon: int = 5,
-        alpha: float = 1.0,
-        terminal_weight: CooperativeTerminalWeight = "hover",
-        *,
-        neighbour: Neighbour = "cv",
-        feed_forward: bool = True,
-        attitude: bool = False,
-        reach: float = 1.0,
-        speed: float = 2.0,
-        avoidance: AvoidanceRule = "reciprocal",
-        avoidance_set: AvoidanceSet = "sensed",
-        moving_centre: bool = True,
-        braking_time: float | None = None,
-        swirl: float = math.radians(5.0),
-        separation_weight: float = 1e3,
-        separation_margin: float = 0.03,
-        plan_tilt: float = 0.5,
-        turning: bool = True,
-        soft_weight: float = 1e3,
-        margin: float = 0.02,
-        reject_disturbance: bool = False,
-        estimator_gain: float | Literal["auto"] = "auto",
-        iteration_limit: int = ITERATION_LIMIT,
-    ) -> None:
+    options_type = FormationMpcOptions
+
+    def __init__(self, task: TeamTask, options: FormationMpcOptions | None = None, **changes: Any) -> None:
         if task.layout.target:
             raise ValueError(
                 f"consensus-mpc has no answer to the target of {task.env_id!r}: take cooperative-mpc"
             )
-        controller = CooperativeMpc(
-            task, horizon, alpha, terminal_weight, neighbour=neighbour, feed_forward=feed_forward,
-            attitude=attitude, reach=reach, speed=speed, avoidance=avoidance, avoidance_set=avoidance_set,
-            moving_centre=moving_centre, braking_time=braking_time, swirl=swirl,
-            separation_weight=separation_weight, separation_margin=separation_margin, plan_tilt=plan_tilt,
-            turning=turning, soft_weight=soft_weight, margin=margin,
-            reject_disturbance=reject_disturbance, estimator_gain=estimator_gain,
-            iteration_limit=iteration_limit,
-        )  # fmt: skip
-        super().__init__(controller, "consensus-mpc", 0)
+        options = chosen(FormationMpcOptions, options, changes)
+        super().__init__(CooperativeMpc(task, shared(CooperativeOptions, options)), "consensus-mpc", 0)
 
     def _decide(self, obs: Actions, state: PolicyState, start: Flags) -> tuple[Actions, PolicyState]:
         parts, memory = self._decode(obs, state.memory, start)
@@ -217,84 +166,70 @@ class TargetMpc(CooperativePolicy):
         return self._act(decision, filters, estimates, state, start)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TargetMpcOptions(CooperativeOptions):
+    """What the policy of chapter 7 lets choose."""
+
+    reach: float = 2.0  # m, governor: largest distance of a reference, wide: the target is far at the start
+    estimator: Any = (
+        None  # "ekf" (None), "trilateration", "polar-ekf", "random-walk", or an object of the user's
+    )
+    q: Any = None  # of the estimator, m^2/s^3 of "ekf"; None: 0.02 for estimation, 0.05 for tracking
+    estimates: EstimateSource | None = (
+        None  # "own", a filter per agent in `state`, or "shared", what `EstimateWrapper` put into the
+        # observation; None: shared where it is there
+    )
+
+
 def make_cooperative_mpc(
-    task: TeamTask,
-    horizon: int = 5,
-    alpha: float = 1.0,
-    terminal_weight: CooperativeTerminalWeight = "hover",
-    *,
-    estimator: Any = None,
-    q: Any = None,
-    estimates: EstimateSource | None = None,
-    neighbour: Neighbour = "cv",
-    feed_forward: bool = True,
-    attitude: bool = False,
-    reach: float = 2.0,
-    speed: float = 2.0,
-    formation_weight: float = 0.1,
-    target: TargetModel = "cv",
-    avoidance: AvoidanceRule = "reciprocal",
-    avoidance_set: AvoidanceSet = "sensed",
-    moving_centre: bool = True,
-    braking_time: float | None = None,
-    swirl: float = math.radians(5.0),
-    separation_weight: float = 1e3,
-    separation_margin: float = 0.03,
-    plan_tilt: float = 0.5,
-    turning: bool = True,
-    soft_weight: float = 1e3,
-    margin: float = 0.02,
-    reject_disturbance: bool = False,
-    estimator_gain: float | Literal["auto"] = "auto",
-    iteration_limit: int = ITERATION_LIMIT,
+    task: TeamTask, options: TargetMpcOptions | None = None, **changes: Any
 ) -> TeamPolicy:
     """The policy of chapter 7. Where vehicles run on rails, its answer is its estimate.
-
-    Options are those of `controllers.team.cooperative.CooperativeMpc` (reach is 2 m: the target is far at the
-    start), and three more. `estimator` is "ekf" (None), "trilateration", "polar-ekf", "random-walk" or an
-    object of the user's, and `q` belongs to it, see `estimation.make_estimator`; None: 0.02 for
-    estimation, 0.05 m^2/s^3 for tracking. `estimates` is "own", a filter per agent in `state`, or "shared",
-    what `EstimateWrapper` put into the observation; None: shared where it is there.
 
     Behind the target "aircraft", at up to 2.5 m/s, 1.0 m of error are left (RMS of the last 5 s, 20 flights,
     no crash), and 0.86 m with `q=0.4` and `speed=4`: the reference has the target's velocity and not its
     acceleration of 1 m/s^2, of which about 0.7 s^2 times it remain as lag, whatever the governor's speed.
 
+    Args:
+        task: With a target.
+        options: See `TargetMpcOptions`; None for the defaults.
+        changes: Fields of it, such as horizon=10, which replace those of `options`.
+
     Raises:
+        TypeError: If there is no such option.
         ValueError: If the task has no target, or an option is not allowed.
     """
-    name, shared = "cooperative-mpc", _shares_estimates(task, estimates, q, estimator)
-    controller = CooperativeMpc(
-        task, horizon, alpha, terminal_weight, neighbour=neighbour, feed_forward=feed_forward,
-        attitude=attitude, reach=reach, speed=speed, formation_weight=formation_weight, target=target,
-        avoidance=avoidance, avoidance_set=avoidance_set, moving_centre=moving_centre,
-        braking_time=braking_time, swirl=swirl, separation_weight=separation_weight,
-        separation_margin=separation_margin, plan_tilt=plan_tilt, turning=turning,
-        soft_weight=soft_weight, margin=margin, reject_disturbance=reject_disturbance,
-        estimator_gain=estimator_gain, iteration_limit=iteration_limit,
-    )  # fmt: skip
+    options = chosen(TargetMpcOptions, options, changes)
+    name, (estimator, q) = "cooperative-mpc", (options.estimator, options.q)
+    told = _shares_estimates(task, options)
+    controller = CooperativeMpc(task, options)
     if task.mission != "estimation":
-        return TargetMpc(controller, None if shared else make_estimator(task, estimator, q))
-    return SharedEstimatePolicy(task, name) if shared else EstimatorPolicy(task, name, estimator, q)
+        return TargetMpc(controller, None if told else make_estimator(task, estimator, q))
+    return SharedEstimatePolicy(task, name) if told else EstimatorPolicy(task, name, estimator, q)
 
 
-def _shares_estimates(task: TeamTask, estimates: Any, q: Any, estimator: Any) -> bool:
+make_cooperative_mpc.options_type = TargetMpcOptions  # type: ignore[attr-defined]
+
+
+def _shares_estimates(task: TeamTask, options: TargetMpcOptions) -> bool:
     """Whether the estimates come from the observation.
 
     Raises:
         ValueError: If there is no such source, the observation has no estimates, or q would have no effect.
     """
+    estimates = options.estimates
     if estimates is not None and estimates not in get_args(EstimateSource):
         raise ValueError(unknown_name("value of estimates", estimates, get_args(EstimateSource)))
-    shared = task.layout.estimate if estimates is None else estimates == "shared"
-    if shared and not task.layout.estimate:
+    told = task.layout.estimate if estimates is None else estimates == "shared"
+    if told and not task.layout.estimate:
         raise ValueError(
             f"estimates='shared' needs estimates in the observation of {task.env_id!r}: put an "
             "EstimateWrapper around the environment, or take estimates='own'"
         )
-    for name, value in (("q", q), ("estimator", estimator)):
-        if shared and value is not None:
+    for name in ("q", "estimator"):
+        value = getattr(options, name)
+        if told and value is not None:
             raise ValueError(
                 f"{name} = {value!r} belongs to a filter of one's own: give it to the EstimateWrapper instead"
             )
-    return bool(shared)
+    return bool(told)

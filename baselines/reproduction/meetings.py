@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from controllers.team.cooperative import CooperativeMpc
+from controllers.team.situation import TeamSituation
 from quad_envs.dynamics import simulate
 from quad_envs.formations import start_positions
 from quad_envs.limits import Limits
@@ -49,7 +50,7 @@ def fly_led(controller: CooperativeMpc, start: Array, preview: Preview, steps: i
     plants = np.zeros((rows, 16))
     plants[:, :3], plants[:, 12:] = start.reshape(rows, 3), task.hover_force
     last, memory = plants[:, 12:].copy(), np.zeros((rows, controller.memory_size))
-    leads, comm, disturbance = np.ones(rows), np.zeros((rows, 0, task.layout.comm_size)), np.zeros((rows, 6))
+    leads, comm = np.ones(rows), np.zeros((rows, 0, task.layout.comm_size))
     history = [start]
     for k in range(steps):
         p = plants[:, :3].reshape(teams, n, 3)
@@ -60,9 +61,7 @@ def fly_led(controller: CooperativeMpc, start: Array, preview: Preview, steps: i
         window = np.concatenate([(r - p[:, :, None]).reshape(rows, stages, 3),
                                  w.reshape(rows, stages, 3), heading], axis=-1)  # fmt: skip
         sensed = sensed_rows(p, v.reshape(teams, n, 3), task).reshape(rows, -1, 7)
-        decision = controller.decide(
-            plants, last, leads, window, comm, sensed, None, None, None, None, disturbance, memory
-        )
+        decision = controller.decide(TeamSituation(plants, last, comm, sensed, leads, window), memory)
         last, memory = decision.command, decision.memory
         plants = simulate(plants, last, task.params)
         history.append(plants[:, :3].reshape(teams, n, 3).copy())

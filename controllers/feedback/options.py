@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from quad_envs.checks import require_choice
 from quad_envs.names import shown
 
-from ..mpc.options import Frame, VelocityReference, require_alpha
+from ..mpc.options import FactorisationOptions, Frame, VelocityReference
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,16 +38,15 @@ class LqrOptions(StateFeedbackOptions):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SdreOptions(StateFeedbackOptions):
+class SdreOptions(FactorisationOptions, StateFeedbackOptions):
     """What `Sdre` lets choose."""
 
     velocity_reference: VelocityReference = (
         "heading"  # V_B is compared with v_ref turned by the present heading, or "attitude": by the attitude
     )
-    alpha: float = 1.0  # member of the family of factorisations, in [0, 1]; 1/2 is the dissertation's
 
     def __post_init__(self) -> None:
-        require_alpha(self.alpha)
+        FactorisationOptions.__post_init__(self)
         StateFeedbackOptions.__post_init__(self)
 
 

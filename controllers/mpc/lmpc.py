@@ -99,7 +99,7 @@ class LinearMPC(Mpc):
             which,
             self._A,
             self._B,
-            not self._own_terminal,
+            not self.options.own_terminal,
             self._data,
             buffer,
             ws,
@@ -108,4 +108,4 @@ class LinearMPC(Mpc):
 
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
         hold_trim(self._A, s.trim, s.c)
-        return Problem(self._A, self._B, self._data.Q, self._data.P, not self._own_terminal, s.r)
+        return Problem(self._A, self._B, self._data.Q, self._data.P, not self.options.own_terminal, s.r)

@@ -168,11 +168,6 @@ class Mpc(ABC):
         self._workspace: tuple[IntArray | None, Array, Workspace] | None = None
         self._backend: Backend | None = None
 
-    @property
-    def _own_terminal(self) -> bool:
-        """Whether the terminal weight is not the one that makes the Riccati recursion stationary."""
-        return np.ndim(self.options.terminal) > 0 or self.options.terminal != 1.0
-
     def decide(
         self,
         plant: ArrayLike,

@@ -46,49 +46,39 @@ def require_alpha(alpha: float) -> None:
         )
 
 
+@dataclass(frozen=True, kw_only=True)  # without slots, so that options of several kinds can be combined
+class FactorisationOptions:
+    """Which of the state-dependent models a controller takes.
+
+    Raises:
+        ValueError: If there is no such one.
+    """
+
+    alpha: float = 1.0  # member of the family of factorisations, in [0, 1]; 1/2 is the dissertation's
+
+    def __post_init__(self) -> None:
+        require_alpha(self.alpha)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MpcOptions:
-    """What every MPC lets choose.
+class ProblemOptions:
+    """What the optimal control problem of every MPC lets choose, of one vehicle or of a team.
 
     Raises:
         ValueError: If an option is not allowed.
     """
 
     horizon: int = 25  # N, samples
-    solver: SolverName = "structured"  # exact in one compiled call, or "osqp"
-    frame: Frame = "heading"  # axes of the problem; "hover" is the dissertation's, for yaw near 0
     soft_weight: float = SOFT_WEIGHT  # exact penalty per unit of a state row; inf makes the rows hard
     margin: float = (
         0.02  # what the plan keeps from each state limit, in its SI unit: for the unmodelled rotor lag
     )
-    reject_disturbance: bool = False  # whether to estimate and cancel disturbances that are not revealed
-    estimator_gain: float | Literal["auto"] = (
-        "auto"  # share of each new residual in the estimate, in (0, 1];
-        # "auto" takes it from `task.sensor_noise`, 0.5 without any
-    )
-    iteration_limit: int = ITERATION_LIMIT  # active-set steps of a solve at most; 0: one that grows with it
     Q: ArrayLike | None = None  # weight of the state: number, diagonal (12,) or matrix; None: the reward's
     R: ArrayLike | None = None  # weight of the forces: number, diagonal (4,) or matrix; None: the reward's
-    plan_tilt: float | None = (
-        None  # rad, largest roll and pitch of a plan besides the task's limit: where the
-        # model holds; inf is no limit. None: 0.8 (exact model 1.0) in frame "heading", inf in "hover"
-    )
-    plan_rate: float | None = (
-        None  # rad/s, largest roll and pitch rate of a plan, half of it in yaw, likewise. None: 0.3 rad
-        # a sample in frame "heading", inf in "hover"
-    )
     terminal: ArrayLike = 1.0  # factor of P, the weight of x_N, or a matrix (12, 12) in the problem's axes
-    R_rate: ArrayLike | None = (
-        None  # weight of the changes of the forces from sample to sample, the first one against the command
-        # applied before: number, diagonal (4,) or matrix; None: changes cost nothing
-    )
-
-    usual_tilt: ClassVar[float] = PLAN_TILT
 
     def __post_init__(self) -> None:
         require_horizon(self.horizon)
-        require_choice("solver", self.solver, SolverName)
-        require_choice("frame", self.frame, Frame)
         if not self.soft_weight >= 0.0:
             raise ValueError(
                 f"soft_weight must be >= 0 (math.inf for hard rows), got {shown(self.soft_weight)}"
@@ -97,17 +87,64 @@ class MpcOptions:
             raise ValueError(
                 f"margin must be a finite number >= 0, in SI units of each limit, got {shown(self.margin)}"
             )
+
+    @property
+    def own_terminal(self) -> bool:
+        """Whether the terminal weight is not the one that makes the Riccati recursion stationary."""
+        return np.ndim(self.terminal) > 0 or self.terminal != 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleMpcOptions(ProblemOptions):
+    """What every MPC that decides for one vehicle lets choose, whether it flies alone or in a team."""
+
+    R_rate: ArrayLike | None = (
+        None  # weight of the changes of the forces from sample to sample, the first one against the command
+        # applied before: number, diagonal (4,) or matrix; None: changes cost nothing
+    )
+    reject_disturbance: bool = False  # whether to estimate and cancel disturbances that are not revealed
+    estimator_gain: float | Literal["auto"] = (
+        "auto"  # share of each new residual in the estimate, in (0, 1];
+        # "auto" takes it from `task.sensor_noise`, 0.5 without any
+    )
+    iteration_limit: int = ITERATION_LIMIT  # active-set steps of a solve at most; 0: one that grows with it
+
+    def __post_init__(self) -> None:
+        ProblemOptions.__post_init__(self)
         if self.estimator_gain != "auto" and not 0.0 < self.estimator_gain <= 1.0:
             raise ValueError(
                 f"estimator_gain must be 'auto' or lie in (0, 1], got {shown(self.estimator_gain)}"
             )
+        require_whole(
+            "iteration_limit (0: one that grows with the problem)", self.iteration_limit, 0, MOST_ITERATIONS
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MpcOptions(VehicleMpcOptions):
+    """What every MPC of a vehicle that flies alone lets choose."""
+
+    solver: SolverName = "structured"  # exact in one compiled call, or "osqp"
+    frame: Frame = "heading"  # axes of the problem; "hover" is the dissertation's, for yaw near 0
+    plan_tilt: float | None = (
+        None  # rad, largest roll and pitch of a plan besides the task's limit: where the
+        # model holds; inf is no limit. None: 0.8 (exact model 1.0) in frame "heading", inf in "hover"
+    )
+    plan_rate: float | None = (
+        None  # rad/s, largest roll and pitch rate of a plan, half of it in yaw, likewise. None: 0.3 rad
+        # a sample in frame "heading", inf in "hover"
+    )
+
+    usual_tilt: ClassVar[float] = PLAN_TILT
+
+    def __post_init__(self) -> None:
+        VehicleMpcOptions.__post_init__(self)
+        require_choice("solver", self.solver, SolverName)
+        require_choice("frame", self.frame, Frame)
         for name, unit in (("plan_tilt", "rad"), ("plan_rate", "rad/s")):
             value = getattr(self, name)
             if value is not None and not value > 0.0:
                 raise ValueError(f"{name} must be > 0 {unit}, got {shown(value)}; math.inf is no limit")
-        require_whole(
-            "iteration_limit (0: one that grows with the problem)", self.iteration_limit, 0, MOST_ITERATIONS
-        )
 
     def largest_tilt(self) -> float:
         """The tilt that a plan keeps to, rad: as chosen, else the usual one, in frame "hover" none."""
@@ -139,10 +176,9 @@ class LmpcOptions(MpcOptions):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SdcOptions(MpcOptions):
+class SdcOptions(FactorisationOptions, MpcOptions):
     """What `SdcNmpc` lets choose."""
 
-    alpha: float = 1.0  # member of the family of factorisations, in [0, 1]; 1/2 is the dissertation's
     relinearisations: int | Literal["auto"] = (
         "auto"  # further passes, each with the pairs along the plan of the pass before. "auto" makes one
         # where the plan turns by more than 0.5 rad, none in frame "hover"; 0 is the dissertation's
@@ -156,7 +192,7 @@ class SdcOptions(MpcOptions):
     )
 
     def __post_init__(self) -> None:
-        require_alpha(self.alpha)
+        FactorisationOptions.__post_init__(self)
         if not self.at_need:
             require_whole("relinearisations, if not 'auto',", self.relinearisations, 0, MOST_PASSES)
         require_choice("velocity_reference", self.axes(), PresentReference)
@@ -167,7 +203,7 @@ class SdcOptions(MpcOptions):
             )
         require_choice("terminal_weight", self.terminal_weight, TerminalWeight)
         MpcOptions.__post_init__(self)
-        if self.terminal_weight == "sdre" and (np.ndim(self.terminal) > 0 or self.terminal != 1.0):
+        if self.terminal_weight == "sdre" and self.own_terminal:
             raise ValueError(
                 "terminal changes P of the hover model; terminal_weight='sdre' has another P at each sample: "
                 "leave terminal out, or choose terminal_weight='hover'"
@@ -232,3 +268,9 @@ def chosen(kind: type[_Options], options: _Options | None, changes: Mapping[str,
         if name not in known:
             raise TypeError(unknown_name(f"field of {kind.__name__}:", name, known))
     return kind(**changes) if options is None else replace(options, **changes)
+
+
+def shared(kind: type[_Options], options: DataclassInstance, **others: Any) -> _Options:
+    """Options of another kind: its fields that these have, too, and others; the rest by default."""
+    own, known = {field.name for field in fields(options)}, [field.name for field in fields(kind)]
+    return kind(**{name: getattr(options, name) for name in known if name in own} | others)

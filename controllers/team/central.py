@@ -23,22 +23,21 @@ import osqp
 import scipy.sparse as sparse
 from numpy.typing import ArrayLike, NDArray
 
-from quad_envs.checks import array_bytes, require_memory, require_whole
-from quad_envs.names import shown
+from quad_envs.checks import array_bytes, require_memory
 from quad_envs.observations.tracking import N_REFERENCE
 from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, VELOCITY, Array
 from quad_envs.rotations import rotation_body_from_inertial, wrap_angle
 from quad_envs.tasks import TeamTask
 from quad_envs.turning import TURN_RATE, turning_rates, with_turn_rates
 
-from ..controller import PLANT_SIZE, Decision, as_array, require_horizon
+from ..controller import PLANT_SIZE, Decision, as_array
 from ..fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, limit_command
 from ..model import sdc_pair
 from ..mpc.kernels import add_rotor_lag, left_model
 from ..mpc.mpc import mpc_data
-from ..mpc.options import MpcOptions
+from ..mpc.options import MpcOptions, chosen, shared
 from ..qp.ocp import Condensed, OcpQp, condense, no_rows
-from ..qp.solution import MOST_ITERATIONS
+from .options import CentralOptions
 
 _SOLVED = 1
 _NO_BOUND = 1e30  # OSQP's infinity
@@ -79,74 +78,52 @@ class CentralMpc:
 
     Args:
         task: What is known of the flight.
-        horizon: N, samples.
-        alpha: See `SdcNmpc`.
-        braking_time: t_b, s; 0 for no braking rows.
-        swirl: Turn of every normal about the vertical, rad: frees an exactly symmetric meeting.
-        separation_weight: Exact penalty per metre of a separation row.
-        soft_weight: Exact penalty per unit of the other state rows.
-        margin: What the plan keeps from each limit of the task, in its SI unit.
-        eps: OSQP's absolute and relative tolerance.
-        max_iter: OSQP's iteration limit.
+        options: See `CentralOptions`; None for the defaults.
+        changes: Fields of it, such as horizon=10, which replace those of `options`.
 
     Raises:
+        TypeError: If there is no such option.
         ValueError: If an option is not allowed, or the team has more than 15 vehicles.
     """
 
-    def __init__(
-        self,
-        task: TeamTask,
-        horizon: int = 5,
-        alpha: float = 1.0,
-        *,
-        braking_time: float = 0.25,
-        swirl: float = math.radians(5.0),
-        separation_weight: float = 1e4,
-        soft_weight: float = 1e3,
-        margin: float = 0.02,
-        eps: float = 1e-6,
-        max_iter: int = 20000,
-    ) -> None:
+    options_type = CentralOptions
+
+    def __init__(self, task: TeamTask, options: CentralOptions | None = None, **changes: Any) -> None:
         if task.vehicles > _MOST_VEHICLES:
             raise ValueError(
                 f"a central MPC takes at most {_MOST_VEHICLES} vehicles, got {task.vehicles}: it fills dense "
                 "matrices, whose size grows with the fourth power of that number; use a distributed MPC"
             )
-        horizon = require_horizon(horizon)
-        if not 0.0 <= alpha <= 1.0:
-            raise ValueError(f"alpha must lie in [0, 1], got {shown(alpha)}")
-        if not (0.0 <= braking_time < math.inf and abs(swirl) < math.pi / 2 and separation_weight > 0.0):
-            raise ValueError(
-                "braking_time must be >= 0 s, |swirl| < pi/2 rad and separation_weight > 0, "
-                f"got {shown(braking_time)}, {swirl!r}, {separation_weight!r}"
-            )
-        require_whole("max_iter", max_iter, 1, MOST_ITERATIONS)
-        if not (eps > 0.0 and math.isfinite(soft_weight) and math.isfinite(separation_weight)):
-            raise ValueError(
-                f"eps must be > 0 and the weights finite, got {eps!r}, {soft_weight!r}, {separation_weight!r}"
-            )
-        inputs = N_INPUT * task.vehicles * horizon
+        self.task, self.options = task, chosen(CentralOptions, options, changes)
+        options, self.horizon = self.options, int(self.options.horizon)
+        inputs = N_INPUT * task.vehicles * self.horizon
         require_memory(
-            f"a central MPC of {task.vehicles} vehicles and horizon {horizon}",
+            f"a central MPC of {task.vehicles} vehicles and horizon {self.horizon}",
             array_bytes((inputs, inputs)),
             "choose a shorter horizon",
         )
-        self.task, self.horizon, self.alpha = task, horizon, float(alpha)
-        self.braking_time, self.swirl = float(braking_time), float(swirl)
-        options = MpcOptions(
-            horizon=horizon, soft_weight=soft_weight, margin=margin, plan_tilt=math.inf, plan_rate=math.inf
-        )
-        self._data = mpc_data(task, options, "attitude")
+        self.alpha, self.braking_time = float(options.alpha), options.braking
+        self.swirl = float(options.swirl)
+        single = shared(MpcOptions, options, plan_tilt=math.inf, plan_rate=math.inf)
+        self._data = mpc_data(task, single, "attitude")
         self._validity = self._data.model_tilt, self._data.first_angle
         self._pairs = np.stack(np.triu_indices(task.vehicles, 1), axis=-1)
         n, N, K = task.vehicles, self.horizon, len(self._data.normal)
-        self._per_pair = N + (braking_time > 0.0)
+        self._per_pair = N + (self.braking_time > 0.0)
         self._weights = np.concatenate(
-            [np.tile(self._data.weight, n), np.full(len(self._pairs) * self._per_pair, separation_weight)]
+            [
+                np.tile(self._data.weight, n),
+                np.full(len(self._pairs) * self._per_pair, float(options.separation_weight)),
+            ]
         )
         self._mask = self._pattern(n, N_INPUT * N, K)
         self.memory_size = 1 + n * N * (N_INPUT + 3)
-        self._settings = {"eps_abs": eps, "eps_rel": eps, "max_iter": max_iter, "polishing": True}
+        self._settings = {
+            "eps_abs": options.eps,
+            "eps_rel": options.eps,
+            "max_iter": options.max_iter,
+            "polishing": True,
+        }
 
     def decide(
         self,

@@ -33,8 +33,8 @@ Deviation:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from dataclasses import KW_ONLY, dataclass
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -52,6 +52,13 @@ AvoidanceSet = Literal["sensed", "edges"]
 COLLISION_SCRATCH = 9
 BRAKING = 4.0  # m/s^2, at a tilt of 0.39 rad
 USUAL_SPEED = 2.0  # m/s
+# Former name of an option -> the one of today.
+_FORMER = {
+    "rule": "avoidance",
+    "neighbours": "avoidance_set",
+    "weight": "separation_weight",
+    "margin": "separation_margin",
+}
 _COINCIDENT = 1e-9  # m, closer vehicles have no direction from one to the other
 _SAME = 0.1  # m, a message and a sensed vehicle closer than that are one: vehicles keep 0.3 m
 
@@ -61,33 +68,72 @@ def time_to_stop(speed: float) -> float:
     return (speed if speed < math.inf else USUAL_SPEED) / BRAKING
 
 
-@dataclass(frozen=True, slots=True)
-class AvoidanceOptions:
-    """How a vehicle keeps away from others.
+@dataclass(frozen=True)  # without slots, as the next one, so that options of several kinds can be combined
+class SeparationOptions:
+    """What every MPC lets choose that keeps vehicles apart.
 
     Raises:
         ValueError: If one is not allowed.
     """
 
-    rule: AvoidanceRule = "reciprocal"  # "frozen" is the text's with its sign corrected; both for study
-    neighbours: AvoidanceSet = "sensed"  # whom rows are for; "edges": those it hears within the radius
-    moving_centre: bool = True  # of the rule "reciprocal", as the next two
-    braking_time: float = USUAL_SPEED / BRAKING  # s, t_b; 0: no braking row
+    _: KW_ONLY
+    braking_time: float | None = (
+        None  # s, t_b; 0: no braking row. None: the time in which 4 m/s^2 stop a vehicle at the governor's
+        # `speed`, or at 2 m/s where there is none
+    )
     swirl: float = math.radians(5.0)  # rad, turn of every normal about the vertical
-    weight: float = 1e3  # L1 penalty per metre
-    margin: float = 0.03  # m, of the rule "reciprocal": what the plan keeps beyond the separation
+    separation_weight: float = 1e3  # exact penalty per metre of a separation row
 
     def __post_init__(self) -> None:
-        require_choice("avoidance", self.rule, AvoidanceRule)
-        require_choice("avoidance set", self.neighbours, AvoidanceSet)
-        if not 0.0 <= self.braking_time < math.inf:
+        if not 0.0 <= self.braking < math.inf:
             raise ValueError(f"braking_time must be finite and >= 0 s, got {shown(self.braking_time)}")
         if not abs(self.swirl) < math.pi / 2:
             raise ValueError(f"swirl must lie in (-pi/2, pi/2) rad, got {shown(self.swirl)}")
-        if not 0.0 <= self.margin < math.inf:
-            raise ValueError(f"separation_margin must be finite and >= 0 m, got {shown(self.margin)}")
-        if not self.weight > 0.0:
-            raise ValueError(f"the weight of separation must be > 0 per m, got {shown(self.weight)}")
+        if not self.separation_weight > 0.0:
+            raise ValueError(f"separation_weight must be > 0 per m, got {shown(self.separation_weight)}")
+
+    @property
+    def fastest(self) -> float:
+        """The governor's speed, m/s; inf for none."""
+        return math.inf
+
+    @property
+    def braking(self) -> float:
+        """t_b, s."""
+        return time_to_stop(self.fastest) if self.braking_time is None else float(self.braking_time)
+
+
+@dataclass(frozen=True)
+class AvoidanceOptions(SeparationOptions):
+    """How a vehicle keeps away from others.
+
+    Raises:
+        TypeError: If an option is called as it was before.
+        ValueError: If one is not allowed.
+    """
+
+    avoidance: AvoidanceRule = (
+        "reciprocal"  # rule: "frozen" is the dissertation's, its sign corrected; "plan"; "none"
+    )
+    avoidance_set: AvoidanceSet = "sensed"  # whom rows are for; "edges": those it hears within the radius
+    moving_centre: bool = True  # whether the common centre of a pair moves with it; "reciprocal" alone
+    _: KW_ONLY
+    separation_margin: float = 0.03  # m, what the plan keeps beyond the separation; "reciprocal" alone
+
+    def __new__(cls, *args: Any, **options: Any) -> AvoidanceOptions:
+        """Refuse names of before; all else is checked later."""
+        for name in _FORMER.keys() & options.keys() if cls is AvoidanceOptions else ():
+            raise TypeError(f"AvoidanceOptions calls {name} now {_FORMER[name]}, as CooperativeMpc does")
+        return object.__new__(cls)
+
+    def __post_init__(self) -> None:
+        SeparationOptions.__post_init__(self)
+        require_choice("avoidance", self.avoidance, AvoidanceRule)
+        require_choice("avoidance_set", self.avoidance_set, AvoidanceSet)
+        if not 0.0 <= self.separation_margin < math.inf:
+            raise ValueError(
+                f"separation_margin must be finite and >= 0 m, got {shown(self.separation_margin)}"
+            )
 
     def require_plans(self, stages: int) -> None:
         """Check that messages have plans of so many stages where the rule reads them.
@@ -95,32 +141,32 @@ class AvoidanceOptions:
         Raises:
             ValueError: If they have none.
         """
-        if self.rule == "plan" and stages == 0:
+        if self.avoidance == "plan" and stages == 0:
             raise ValueError(
                 "avoidance='plan' needs plans in the messages: make the environment with comm='plan'"
             )
 
-    def data(self, separation: float, radius: float, dt: float) -> AvoidanceData:
+    def avoidance_data(self, separation: float, radius: float, dt: float) -> AvoidanceData:
         """The same for compiled code."""
-        reciprocal = self.rule == "reciprocal"
+        reciprocal = self.avoidance == "reciprocal"
         turn = self.swirl if reciprocal else 0.0
         return AvoidanceData(
-            self.rule == "none", self.rule == "plan", self.neighbours == "edges",
+            self.avoidance == "none", self.avoidance == "plan", self.avoidance_set == "edges",
             0.5 if reciprocal else 1.0, self.moving_centre and reciprocal,
-            float(self.braking_time) if reciprocal else 0.0, math.sin(turn), math.cos(turn),
-            float(separation) + (self.margin if reciprocal else 0.0), float(radius), float(dt),
+            self.braking if reciprocal else 0.0, math.sin(turn), math.cos(turn),
+            float(separation) + (self.separation_margin if reciprocal else 0.0), float(radius), float(dt),
         )  # fmt: skip
 
-    def layout(self, slots: int, horizon: int) -> StateRows:
+    def separation_layout(self, slots: int, horizon: int) -> StateRows:
         """The rows of all slots with their numbers left open: normals zero, no bounds.
 
         A slot has one normal, a second one for its braking row, or with rule "plan" one for each stage.
         """
-        if self.rule == "none" or slots == 0:
+        if self.avoidance == "none" or slots == 0:
             return no_rows()
-        braking = self.rule == "reciprocal" and self.braking_time > 0.0
+        braking = self.avoidance == "reciprocal" and self.braking > 0.0
         stages = np.arange(1, horizon + 1)
-        normal = stages - 1 if self.rule == "plan" else np.zeros(horizon, dtype=np.int64)
+        normal = stages - 1 if self.avoidance == "plan" else np.zeros(horizon, dtype=np.int64)
         if braking:
             stages, normal = np.append(stages, horizon), np.append(normal, 1)
         first = (normal.max() + 1) * np.arange(slots)[:, None]
@@ -131,7 +177,7 @@ class AvoidanceOptions:
             stage=np.tile(stages, slots).astype(np.int64),
             lower=np.full(rows, -math.inf),
             upper=np.full(rows, math.inf),
-            weight=np.full(rows, float(self.weight)),
+            weight=np.full(rows, float(self.separation_weight)),
         )
 
 

@@ -25,53 +25,75 @@ from quad_envs.checks import require_choice
 from quad_envs.observations.team import N_COMM, N_PLAN_STAGE
 from quad_envs.observations.tracking import N_REFERENCE
 from quad_envs.parameters import Array
+from quad_envs.tasks import TeamTask
 
 from ..controller import PLANT_SIZE, as_array
 from .consensus_kernels import CONSENSUS_SCRATCH, ConsensusData, consensus_row
+from .situation import TargetEstimate
 
 Neighbour = Literal["cv", "frozen", "ca", "plan"]
 TargetModel = Literal["cv", "frozen"]
 
 
-@dataclass(frozen=True, slots=True)
-class ConsensusOptions:
+@dataclass(frozen=True)  # without slots, as the next one, so that options of several kinds can be combined
+class NeighbourOptions:
+    """How references are made of messages.
+
+    Raises:
+        ValueError: If one is not allowed; `attitude` needs `neighbour="ca"`.
+    """
+
+    neighbour: Neighbour = (
+        "cv"  # how neighbours move on over the horizon: "cv", constant velocity; "frozen", the
+        # dissertation's; "ca", constant acceleration, from their attitude; "plan", as they sent
+    )
+    feed_forward: bool = True  # whether the own term moves on with its velocity; the dissertation's does not
+    attitude: bool = False  # tilt references from the neighbours' accelerations; diverges on cyclic graphs
+    reach: float = 1.0  # m, governor: largest distance of a reference; inf for none, as in the dissertation
+    speed: float = 2.0  # m/s, governor: largest velocity reference, above the leader's; inf for none
+
+    def __post_init__(self) -> None:
+        require_choice("neighbour", self.neighbour, Neighbour)
+        if self.attitude and self.neighbour != "ca":
+            raise ValueError(
+                f"attitude needs the neighbours' accelerations: set neighbour='ca', got {self.neighbour!r}"
+            )
+        _require_positive(reach=self.reach, speed=self.speed)
+
+
+@dataclass(frozen=True)
+class ConsensusOptions(NeighbourOptions):
     """How references are made of messages and of a target estimate.
 
     Raises:
         ValueError: If one is not allowed; `attitude` needs `neighbour="ca"`.
     """
 
-    neighbour: Neighbour = "cv"  # extrapolation: constant velocity, acceleration, frozen, or the sent plan
-    feed_forward: bool = True  # whether the own term moves on with its velocity; the dissertation's does not
-    attitude: bool = False  # tilt references from the neighbours' accelerations; diverges on cyclic graphs
-    reach: float = 1.0  # m, governor: largest distance of a reference; inf for none
-    speed: float = 2.0  # m/s, governor: largest velocity reference; inf for none
     formation_weight: float = (
         0.1  # m^2, P_f of (7.2): the estimate's variance at which both sides weigh alike
     )
-    target: TargetModel = "cv"  # the target moves on over the horizon, or stays (the dissertation)
+    target: TargetModel = "cv"  # the target moves on over the horizon, or "frozen": stays (the dissertation)
 
     def __post_init__(self) -> None:
-        require_choice("neighbour", self.neighbour, Neighbour)
+        NeighbourOptions.__post_init__(self)
         require_choice("target", self.target, TargetModel)
-        if self.attitude and self.neighbour != "ca":
-            raise ValueError(
-                f"attitude needs the neighbours' accelerations: set neighbour='ca', got {self.neighbour!r}"
-            )
-        for name in ("reach", "speed", "formation_weight"):
-            value = getattr(self, name)
-            if not value > 0.0:
-                raise ValueError(f"{name} must be > 0, got {value!r}; math.inf is no limit")
+        _require_positive(formation_weight=self.formation_weight)
         if math.isinf(self.formation_weight):
             raise ValueError("formation_weight must be finite, m^2; large means: follow the estimate")
 
-    def data(self, dt: float, gravity: float) -> ConsensusData:
+    def consensus_data(self, dt: float, gravity: float) -> ConsensusData:
         """The same for compiled code."""
         return ConsensusData(
             get_args(Neighbour).index(self.neighbour), bool(self.feed_forward), bool(self.attitude),
             float(self.reach), float(self.speed), float(self.formation_weight), self.target == "cv",
             float(dt), float(gravity),
         )  # fmt: skip
+
+
+def _require_positive(**options: float) -> None:
+    for name, value in options.items():
+        if not value > 0.0:
+            raise ValueError(f"{name} must be > 0, got {value!r}; math.inf is no limit")
 
 
 class ConsensusReference(NamedTuple):
@@ -103,15 +125,6 @@ def _reference_rows(
         )  # fmt: skip
 
 
-class TargetEstimate(NamedTuple):
-    """What each vehicle believes of the target, and where it wants to be."""
-
-    r: ArrayLike  # (n, 3), r^ - p_i
-    v: ArrayLike  # (n, 3), inertial
-    P: ArrayLike  # (n, 3, 3), covariance of r^
-    slot: ArrayLike  # (n, 3), delta_it = wanted p_i - r_t
-
-
 def consensus_reference(
     plant: ArrayLike,
     comm: ArrayLike,
@@ -121,8 +134,8 @@ def consensus_reference(
     leader: ArrayLike | None = None,
     preview: ArrayLike | None = None,
     target: TargetEstimate | None = None,
-    dt: float = 0.05,
-    gravity: float = 9.8,
+    task: TeamTask | None = None,
+    **former: float,
 ) -> ConsensusReference:
     """References of vehicles from their messages, (5.4) corrected; with a target estimate fused, (7.2).
 
@@ -135,16 +148,21 @@ def consensus_reference(
         preview: The leader's reference relative to its own position, (n, >= N+1, 8); rows of others are not
             read.
         target: Estimates to fuse with; a huge covariance leaves the pure formation reference.
-        dt: Control period, s.
-        gravity: m/s^2.
+        task: What is known of the flight, for its control period and gravity; None: the usual one.
+        former: Nothing: `dt` and `gravity` were arguments of their own before.
 
     Returns:
         Windows relative to each vehicle's own position, and roll and pitch references.
 
     Raises:
+        TypeError: If there is no such argument.
         ValueError: If a shape is wrong, or plans are wanted that the messages lack.
     """
-    options = ConsensusOptions() if options is None else options
+    for name in former:
+        raise TypeError(
+            f"consensus_reference has no {name}: pass task=..., whose dt and params.gravity it takes"
+        )
+    options, task = options or ConsensusOptions(), task or TeamTask()
     plants, comms = as_array(plant), as_array(comm)
     n, stages = len(plants), horizon + 1
     leads = np.zeros(n) if leader is None else as_array(leader)
@@ -162,7 +180,7 @@ def consensus_reference(
     if target is not None and (r.shape[1], v.shape[1], P.shape[1], slot.shape[1]) != (3, 3, 9, 3):
         raise ValueError("target needs r (n, 3), v (n, 3), P (n, 3, 3) and slot (n, 3)")
     out = ConsensusReference(np.empty((n, stages, N_REFERENCE)), np.empty((n, stages, 2)))
-    data, work = options.data(dt, gravity), np.empty(CONSENSUS_SCRATCH)
+    data, work = options.consensus_data(task.dt, task.params.gravity), np.empty(CONSENSUS_SCRATCH)
     _reference_rows(plants, leads, previews, comms, r, v, P, slot, data, *out, work)
     return out
 

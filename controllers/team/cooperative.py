@@ -12,32 +12,29 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quad_envs.checks import require_choice
-from quad_envs.names import shown
 from quad_envs.observations.team import N_PLAN_STAGE, N_SENSED
 from quad_envs.observations.tracking import N_REFERENCE
 from quad_envs.parameters import N_INPUT, Array
 from quad_envs.tasks import TeamTask
 
-from ..controller import PLANT_SIZE, as_array, require_horizon
+from ..controller import PLANT_SIZE, as_array
 from ..disturbance import ESTIMATOR_SIZE, N_DISTURBANCE
 from ..mpc.kernels import MEMORY_STAGE, buffer_size, carve
 from ..mpc.mpc import mpc_data
-from ..mpc.options import MpcOptions
+from ..mpc.options import MpcOptions, chosen, shared
 from ..qp.ocp import IntArray, OcpQp, StateRows, concatenate_rows
-from ..qp.structured import ITERATION_LIMIT, make_workspace
-from .collision import COLLISION_SCRATCH, AvoidanceOptions, AvoidanceRule, AvoidanceSet, time_to_stop
-from .consensus import ConsensusOptions, Neighbour, TargetModel, require_messages
+from ..qp.structured import make_workspace
+from .collision import COLLISION_SCRATCH
+from .consensus import require_messages
 from .consensus_kernels import CONSENSUS_SCRATCH
 from .cooperative_kernels import NAMES, RowLayout, Team, decide_team, pose_row
-
-CooperativeTerminalWeight = Literal["hover", "stage"]
-_TARGET = NAMES.index("estimate_r"), NAMES.index("slot") + 1
+from .options import CooperativeOptions
+from .situation import TeamSituation
 
 
 class CooperativeDecision(NamedTuple):
@@ -63,170 +60,74 @@ class CooperativeMpc:
 
     Args:
         task: What is known of the flight; its layout gives the number of slots and the length of messages.
-        horizon: N, samples.
-        alpha: Member of the family of factorisations, in [0, 1]; 1/2 is the dissertation's.
-        terminal_weight: "hover" or "stage".
-        neighbour: How neighbours move on over the horizon: "cv" (constant velocity), "frozen" (the
-            dissertation), "ca" (constant acceleration, from their attitude), "plan" (what they sent).
-        feed_forward: Whether the own term of the consensus moves on, too.
-        attitude: Whether tilt references come from the neighbours' accelerations; needs "ca", and a graph
-            without cycles among followers.
-        reach: Largest distance of a reference, m; inf for none. The dissertation has no such governor.
-        speed: Largest velocity reference, m/s; inf for none. Above the leader's speed.
-        formation_weight: P_f of (7.2), m^2.
-        target: Whether the target moves on over the horizon: "cv" or "frozen".
-        avoidance: "reciprocal", "frozen" (the dissertation's, its sign corrected), "plan" or "none".
-        avoidance_set: Whom to avoid, "sensed" or "edges".
-        moving_centre: Whether the common centre of a pair moves with it.
-        braking_time: t_b, s; 0 for no braking row, None for the time in which 4 m/s^2 stop a vehicle at the
-            governor's `speed`, or at 2 m/s where that is inf.
-        swirl: Turn of the normals about the vertical, rad.
-        separation_weight: Penalty per metre of a separation row; `collision.py` says why not more.
-        separation_margin: What the plan keeps beyond the separation, m.
-        plan_tilt: Largest roll and pitch of a plan, rad, besides the task's limit; inf for none. Rows that
-            push a vehicle upside down push it to where its model holds no longer. With alpha = 1/2 vehicles
-            that meet at 2 m/s each need 0.7.
-        turning: Whether predicted positions follow the velocity as the predicted attitude turns it; the
-            dissertation's keep the present R_BI.
-        soft_weight: Exact penalty per unit of the other state rows; inf makes them hard.
-        margin: What the plan keeps from each limit of the task, in its SI unit.
-        reject_disturbance: Whether to estimate and cancel disturbances that are not revealed.
-        estimator_gain: Share of each new residual in the estimate, in (0, 1]; "auto" takes it from
-            `task.sensor_noise`, 0.5 without any.
-        iteration_limit: Largest number of active-set steps of a solve; 0 for one that grows with it.
+        options: See `CooperativeOptions`; None for the defaults.
+        changes: Fields of it, such as horizon=10, which replace those of `options`.
 
     Raises:
+        TypeError: If there is no such option.
         ValueError: If an option is not allowed.
     """
 
-    def __init__(
-        self,
-        task: TeamTask,
-        horizon: int = 5,
-        alpha: float = 1.0,
-        terminal_weight: CooperativeTerminalWeight = "hover",
-        *,
-        neighbour: Neighbour = "cv",
-        feed_forward: bool = True,
-        attitude: bool = False,
-        reach: float = 1.0,
-        speed: float = 2.0,
-        formation_weight: float = 0.1,
-        target: TargetModel = "cv",
-        avoidance: AvoidanceRule = "reciprocal",
-        avoidance_set: AvoidanceSet = "sensed",
-        moving_centre: bool = True,
-        braking_time: float | None = None,
-        swirl: float = math.radians(5.0),
-        separation_weight: float = 1e3,
-        separation_margin: float = 0.03,
-        plan_tilt: float = 0.5,
-        turning: bool = True,
-        soft_weight: float = 1e3,
-        margin: float = 0.02,
-        reject_disturbance: bool = False,
-        estimator_gain: float | Literal["auto"] = "auto",
-        iteration_limit: int = ITERATION_LIMIT,
-    ) -> None:
-        horizon = require_horizon(horizon)
-        if not 0.0 <= alpha <= 1.0:
-            raise ValueError(f"alpha must lie in [0, 1], got {shown(alpha)}; 1/2 is the dissertation's")
-        require_choice("terminal_weight", terminal_weight, CooperativeTerminalWeight)
-        if not plan_tilt > 0.0:
-            raise ValueError(f"plan_tilt must be > 0 rad, got {shown(plan_tilt)}; math.inf is no limit")
-        self.task, self.horizon = task, horizon
-        self.consensus = ConsensusOptions(
-            neighbour, feed_forward, attitude, reach, speed, formation_weight, target
-        )
-        if braking_time is None:
-            braking_time = time_to_stop(speed)
-        self.avoidance = AvoidanceOptions(
-            avoidance, avoidance_set, moving_centre, braking_time, swirl, separation_weight, separation_margin
-        )
-        self.options = MpcOptions(
-            horizon=horizon,
-            soft_weight=soft_weight,
-            margin=margin,
-            reject_disturbance=reject_disturbance,
-            estimator_gain=estimator_gain,
-            iteration_limit=iteration_limit,
-            plan_tilt=math.inf,  # `_prepare` makes it a limit of the task
-            plan_rate=math.inf,
-        )
-        require_messages(task.layout.comm_size, self.consensus)
-        self.avoidance.require_plans(task.layout.plan)
-        self._prepare(float(alpha), terminal_weight == "stage", float(plan_tilt), bool(turning))
-        estimator = ESTIMATOR_SIZE if reject_disturbance else 0
+    options_type = CooperativeOptions
+
+    def __init__(self, task: TeamTask, options: CooperativeOptions | None = None, **changes: Any) -> None:
+        self.task, self.options = task, chosen(CooperativeOptions, options, changes)
+        self.horizon = int(self.options.horizon)
+        require_messages(task.layout.comm_size, self.options)
+        self.options.require_plans(task.layout.plan)
+        self._prepare()
+        estimator = ESTIMATOR_SIZE if self.options.reject_disturbance else 0
         self.memory_size = 1 + (MEMORY_STAGE + N_PLAN_STAGE) * self.horizon + estimator
         self._workspace: tuple[Any, ...] | None = None
 
-    def _prepare(self, alpha: float, stage_weight: bool, plan_tilt: float, turning: bool) -> None:
+    def _prepare(self) -> None:
         """Constants for the kernels: the rows of the limits, then those of every slot."""
-        task, edges = self.task, self.avoidance.neighbours == "edges"
-        tilt = min(task.limits.tilt, plan_tilt + self.options.margin)
+        task, options = self.task, self.options
+        tilt = min(task.limits.tilt, float(options.plan_tilt) + options.margin)
         planned = replace(task, limits=replace(task.limits, tilt=tilt))
-        data = mpc_data(planned, self.options, "attitude")
-        slots = task.layout.neighbours if edges else task.layout.sensed
+        single = shared(MpcOptions, options, plan_tilt=math.inf, plan_rate=math.inf)  # a limit of the task
+        data = mpc_data(planned, single, "attitude")
+        slots = task.layout.neighbours if options.avoidance_set == "edges" else task.layout.sensed
         limits = StateRows(data.normals, data.normal, data.stage, data.lower, data.upper, data.weight)
-        separation = self.avoidance.layout(slots, self.horizon)
+        separation = options.separation_layout(slots, self.horizon)
         rows = concatenate_rows(limits, separation)
         axis = np.concatenate([data.axis, np.full(len(separation.normals), -1)])
         self._data = data._replace(**rows._asdict(), axis=axis, kinematics=True)
+        alpha = float(options.alpha)
         self._layout = RowLayout(
-            alpha, alpha if turning else 0.0, stage_weight, len(limits.normals), len(limits.normal),
+            alpha, alpha if options.turning else 0.0, options.terminal_weight == "stage",
+            len(limits.normals), len(limits.normal),
             len(separation.normals) // max(slots, 1), len(separation.normal) // max(slots, 1),
             task.layout.comm_size, 1,
         )  # fmt: skip
         self._constants = (
-            self.consensus.data(task.dt, task.params.gravity),
-            self.avoidance.data(task.separation, task.sensing_radius, task.dt),
+            options.consensus_data(task.dt, task.params.gravity),
+            options.avoidance_data(task.separation, task.sensing_radius, task.dt),
             self._layout,
             self._data,
         )
 
-    def decide(
-        self,
-        plant: ArrayLike,
-        last_command: ArrayLike,
-        leader: ArrayLike,
-        preview: ArrayLike,
-        comm: ArrayLike,
-        sensed: ArrayLike,
-        estimate_r: ArrayLike | None,
-        estimate_v: ArrayLike | None,
-        estimate_P: ArrayLike | None,
-        slot: ArrayLike | None,
-        disturbance: ArrayLike,
-        memory: ArrayLike,
-    ) -> CooperativeDecision:
-        """One command per vehicle; rows are independent. Laid out as in `quad_envs.observations.team`.
+    def decide(self, situation: TeamSituation, memory: ArrayLike, *former: Any) -> CooperativeDecision:
+        """One command per vehicle; rows are independent.
 
         Args:
-            plant: Measured [p, V_B, Theta, Omega, F], (n, 16); p matters only where the task limits it.
-            last_command: Last applied rotor commands, (n, 4), N.
-            leader: Which vehicles follow their preview, (n,) bool.
-            preview: Leader's reference relative to its own position, (n, >= N+1, 8); not read of others.
-            comm: Messages, (n, K, 15 + 6 N_p).
-            sensed: Vehicles nearby, (n, K_s, 7).
-            estimate_r: Estimated target position less the own, (n, 3), m; None, as the next three, where
-                there is no target.
-            estimate_v: Estimated target velocity, (n, 3), m/s.
-            estimate_P: Covariance of the estimated position, (n, 3, 3), m^2.
-            slot: Wanted own position relative to the target, (n, 3), m.
-            disturbance: Torque in body axes, N m, and force in inertial axes, N, as far as revealed, (n, 6).
+            situation: What the vehicles measure, hear and believe.
             memory: Of the previous decision, (n, memory_size); zeros for a vehicle that starts.
+            former: Nothing: the parts of the situation were arguments of their own before.
 
         Returns:
             Commands, memory, how they were found, and the predictions.
 
         Raises:
+            TypeError: If the parts of the situation are given one by one.
             ValueError: If a shape is wrong or a number is not finite.
         """
-        arguments = (
-            plant, last_command, leader, preview, comm, sensed, estimate_r, estimate_v, estimate_P, slot,
-            disturbance, memory,
-        )  # fmt: skip
-        team = self._as_team(arguments)
+        if former:
+            raise TypeError(
+                "decide takes a situation and the memory: "
+                f"decide(TeamSituation({', '.join(f'{name}=...' for name in TeamSituation._fields)}), memory)"
+            )
+        team = self._as_team(situation, memory)
         n, N = len(team[0]), self.horizon
         command, kept = np.empty((n, N_INPUT)), np.empty((n, self.memory_size))
         report = np.empty((3, n), np.int64)
@@ -241,9 +142,9 @@ class CooperativeMpc:
         plan = kept[:, -N_PLAN_STAGE * N :].reshape(n, N, N_PLAN_STAGE).copy()
         return CooperativeDecision(command, kept, report[0], report[1], report[2], plan)
 
-    def problems(self, *arguments: ArrayLike | None) -> list[OcpQp]:
+    def problems(self, situation: TeamSituation, memory: ArrayLike) -> list[OcpQp]:
         """The OCP-QP of each vehicle, in its heading frame; arguments as of `decide`. For study and tests."""
-        team, found = self._as_team(arguments), []
+        team, found = self._as_team(situation, memory), []
         which, buffer, work, _ = self._scratch()
         data, layout = self._data, self._layout
         s = carve(buffer, self.horizon, layout.pairs, len(data.normals), len(data.normal), 0)
@@ -273,22 +174,35 @@ class CooperativeMpc:
                     data.rate_step,
                     s.u_last.copy(),
                     rows,
+                    data.R_rate if len(data.R_rate) else None,
                 )
             )
         return found
 
-    def _as_team(self, arguments: tuple[ArrayLike | None, ...]) -> Team:
+    def _as_team(self, situation: TeamSituation, memory: ArrayLike) -> Team:
         """The arguments of `decide` as contiguous float64 arrays, (n, numbers), of the right shapes."""
-        empty = np.zeros((len(np.asarray(arguments[0])), 0))
-        arrays = [empty if value is None else as_array(value) for value in arguments]
-        n, layout = len(arrays[0]), self.task.layout
+        plant, last, comm, sensed, leader, preview, target, disturbance = situation
+        n, layout = len(np.asarray(plant)), self.task.layout
+        window = n, layout.preview + 1, N_REFERENCE
+        arrays = [
+            as_array(value)
+            for value in (
+                plant,
+                last,
+                np.zeros(n) if leader is None else leader,
+                np.zeros(window) if preview is None else preview,
+                comm,
+                sensed,
+                *((np.zeros((n, 0)),) * 4 if target is None else target),
+                np.zeros((n, N_DISTURBANCE)) if disturbance is None else disturbance,
+                memory,
+            )
+        ]
+        believed = ((n, 0),) * 4 if target is None else ((n, 3), (n, 3), (n, 3, 3), (n, 3))
         shapes: list[tuple[int, ...]] = [
-            (n, PLANT_SIZE), (n, N_INPUT), (n,), (n, layout.preview + 1, N_REFERENCE),
-            (n, layout.neighbours, layout.comm_size), (n, layout.sensed, N_SENSED),
-            (n, 3), (n, 3), (n, 3, 3), (n, 3), (n, N_DISTURBANCE), (n, self.memory_size),
+            (n, PLANT_SIZE), (n, N_INPUT), (n,), window, (n, layout.neighbours, layout.comm_size),
+            (n, layout.sensed, N_SENSED), *believed, (n, N_DISTURBANCE), (n, self.memory_size),
         ]  # fmt: skip
-        if all(arguments[k] is None for k in range(*_TARGET)):
-            shapes[slice(*_TARGET)] = [(n, 0)] * 4
         for name, array, shape in zip(NAMES, arrays, shapes, strict=True):
             if array.shape != shape:
                 raise ValueError(
@@ -309,7 +223,7 @@ class CooperativeMpc:
                 np.zeros(1, np.int64) if self.options.reject_disturbance else None,
                 np.zeros(buffer_size(N, 1, len(data.normals), len(data.normal), 0)),
                 np.zeros((N_REFERENCE + 2) * (N + 1) + max(CONSENSUS_SCRATCH, 18 + COLLISION_SCRATCH)),
-                make_workspace(N, len(data.normal), 1),
+                make_workspace(N, len(data.normal), 1, len(data.R_rate) > 0),
             )
         return self._workspace
 
