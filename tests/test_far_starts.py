@@ -6,7 +6,7 @@ import pytest
 
 import quad_envs  # noqa: F401  registers the ids
 from baselines import evaluate, make_policy
-from controllers.mpc.kernels import GOVERNOR_REACH, set_references
+from controllers.frame import GOVERNOR_REACH, set_references
 
 POLICIES = ["lmpc", "sdc-nmpc", "nmpc", "lqr", "feedback-linearization"]
 

@@ -27,7 +27,7 @@ from quad_envs.turning import turn_rate
 
 from ..controller import TURNING_ROWS, FeedbackLaw, first_non_finite
 from ..fallback import HOVER, NONE, limit_command, yield_yaw
-from ..mpc.kernels import governed
+from ..frame import governed
 from ..mpc.options import chosen
 from ..qp.ocp import IntArray
 from .options import FeedbackLinearizationOptions

@@ -15,8 +15,9 @@ from quad_envs.tasks import Task
 from ..controller import TURNING_ROWS, FeedbackLaw, as_one_row, first_non_finite
 from ..disturbance import feed_forward
 from ..fallback import CLIPPED_SDRE, HOVER, NONE, limit_command, yield_yaw
+from ..frame import add_rotor_lag, rotor_lag, set_references, set_state
 from ..model import hover_pair, sdc_matrix, sdc_pair, zero_order_hold
-from ..mpc.kernels import add_rotor_lag, copy_vector, rotor_lag, set_references, set_state
+from ..mpc.kernels import copy_vector
 from ..mpc.options import chosen
 from ..qp.linalg import copy
 from ..qp.ocp import IntArray, OcpQp, no_rows

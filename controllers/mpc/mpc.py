@@ -16,6 +16,7 @@ from quad_envs.tasks import BaseTask, Task
 from ..controller import Decision, as_one_row, as_rows, first_non_finite, raise_non_finite
 from ..disturbance import ESTIMATOR_SIZE, N_DISTURBANCE
 from ..fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXED_WEIGHT
+from ..frame import rotor_lag
 from ..model import hover_pair
 from ..qp import Backend, Status, StructuredSolver
 from ..qp.ocp import IntArray, OcpQp, StateRows, concatenate_rows, no_rows, output_rows
@@ -32,7 +33,6 @@ from .kernels import (
     end_row,
     leaves_bound,
     left_model,
-    rotor_lag,
 )
 from .options import PLAN_TILT, MpcOptions, VelocityAxes
 from .weights import change_weight, require_turnable, terminal_weight, weight_matrix

@@ -32,8 +32,9 @@ from quad_envs.turning import TURN_RATE, turning_rates, with_turn_rates
 
 from ..controller import PLANT_SIZE, Decision, as_array
 from ..fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, limit_command
+from ..frame import add_rotor_lag
 from ..model import sdc_pair
-from ..mpc.kernels import add_rotor_lag, left_model
+from ..mpc.kernels import left_model
 from ..mpc.mpc import mpc_data
 from ..mpc.options import MpcOptions, chosen, shared
 from ..qp.ocp import Condensed, OcpQp, condense, no_rows
