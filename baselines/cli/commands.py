@@ -12,7 +12,7 @@ from dataclasses import replace
 from datetime import datetime
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from quad_envs.names import shortened, unknown_name
 
@@ -62,6 +62,35 @@ def plain_warnings() -> Iterator[None]:
 
 def list_names(options: ListOptions) -> int:
     """Print what there is, or the options of one environment, policy or training algorithm."""
+    if options.name:
+        return _list_options(options)
+    shelves = _shelves()
+    if options.json:
+        print(json.dumps({shelf.key: shelf.entries for shelf in shelves}, indent=1))
+        return 0
+    for shelf in shelves:
+        entries = shelf.entries or ({"-": shelf.if_empty} if shelf.if_empty else {})
+        if not entries:
+            continue
+        print(shelf.title)
+        for name, entry in entries.items():
+            text = entry if isinstance(entry, str) else ", ".join(f"{k}={v!r}" for k, v in entry.items())
+            print(f"  {name:28} {text}")
+    print("\nquad-envs list NAME shows the options of an environment, a policy or a training algorithm")
+    return 0
+
+
+class _Shelf(NamedTuple):
+    """Names of one kind."""
+
+    key: str  # in JSON
+    title: str
+    entries: dict[str, Any]  # name -> what it is, or its options
+    if_empty: str = ""
+
+
+def _shelves() -> list[_Shelf]:
+    """All that has a name."""
     from quad_envs.registration import TRACKING
     from quad_envs.vehicles import VEHICLES
 
@@ -71,59 +100,30 @@ def list_names(options: ListOptions) -> int:
     from ..sweeps.suite_files import suite_names
     from ..training.algorithms import ALGORITHMS
 
-    if options.name:
-        return _list_options(options)
+    vehicles = {
+        name: f"{vehicle.about}, thrust-to-weight {vehicle.thrust_to_weight:.2g} ({vehicle.source})"
+        for name, vehicle in VEHICLES.items()
+    }
     policies = {name: entry.description for name, entry in TRACKING_POLICIES.items()}
     team = {
         name: f"{entry.description}; for {', '.join(entry.missions)}{' (privileged)' * entry.privileged}"
         for name, entry in TEAM_POLICIES.items()
     }
-    vehicles = {
-        name: f"{vehicle.about}, thrust-to-weight {vehicle.thrust_to_weight:.2g} ({vehicle.source})"
-        for name, vehicle in VEHICLES.items()
-    }
     algorithms = {
         name: f"{entry.description}; for {', '.join(entry.missions)}" for name, entry in ALGORITHMS.items()
     }
-    if options.json:
-        found = {"environments": TRACKING, "team_environments": TEAM_KINDS, "vehicles": vehicles}
-        print(
-            json.dumps(
-                found
-                | {
-                    "policies": policies,
-                    "team_policies": team,
-                    "trained_policies": shipped_policies(),
-                    "installed_policies": installed_policies(),
-                    "algorithms": algorithms,
-                    "suites": suite_names(),
-                },
-                indent=1,
-            )
-        )
-        return 0
-    envs = {
-        name: ", ".join(f"{key}={value!r}" for key, value in kwargs.items())
-        for name, kwargs in TRACKING.items()
-    }
-    for title, entries in (
-        ("environments of one vehicle (Gymnasium)", envs),
-        ("environments of several vehicles (PettingZoo)", TEAM_KINDS),
-        ("vehicles: --set vehicle=NAME", vehicles),
-        ("policies for one vehicle", policies),
-        ("policies for several vehicles", team),
-        ("trained policies", shipped_policies() or {"-": "none; quad-envs train ENV ALGORITHM makes one"}),
-        ("policies of other packages", installed_policies()),
-        ("training algorithms", algorithms),
-        ("suites", suite_names()),
-    ):
-        if not entries:
-            continue
-        print(title)
-        for name, text in entries.items():
-            print(f"  {name:28} {text}")
-    print("\nquad-envs list NAME shows the options of an environment, a policy or a training algorithm")
-    return 0
+    none_trained = "none; quad-envs train ENV ALGORITHM makes one"
+    return [
+        _Shelf("environments", "environments of one vehicle (Gymnasium)", TRACKING),
+        _Shelf("team_environments", "environments of several vehicles (PettingZoo)", TEAM_KINDS),
+        _Shelf("vehicles", "vehicles: --set vehicle=NAME", vehicles),
+        _Shelf("policies", "policies for one vehicle", policies),
+        _Shelf("team_policies", "policies for several vehicles", team),
+        _Shelf("trained_policies", "trained policies", shipped_policies(), none_trained),
+        _Shelf("installed_policies", "policies of other packages", installed_policies()),
+        _Shelf("algorithms", "training algorithms", algorithms),
+        _Shelf("suites", "suites", suite_names()),
+    ]
 
 
 def _list_options(options: ListOptions) -> int:

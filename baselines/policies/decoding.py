@@ -128,6 +128,37 @@ def split_memory(memory: Array, start: NDArray[np.bool_], first: Array, second: 
 
 
 @kernel
+def join_memory(first: Array, second: Array, memory: Array) -> None:
+    """Two parts of a memory, (n, a) and (n, b), into one (n, a + b)."""
+    m = first.shape[1]
+    for j in range(memory.shape[0]):
+        for i in range(m):
+            memory[j, i] = first[j, i]
+        for i in range(second.shape[1]):
+            memory[j, m + i] = second[j, i]
+
+
+@kernel
+def encode_plans(plans: Array, dt: float, actions: Actions) -> None:
+    """Plans as the part of the actions that is sent.
+
+    Args:
+        plans: p relative to the present position and v for k+1..k+N, (n, 6 N); past its end it moves on.
+        dt: Control period, s.
+        actions: Output, (n, 6 N_p) float32, in units of PLAN_SCALE.
+    """
+    last = plans.shape[1] // N_PLAN_STAGE - 1
+    for j in range(plans.shape[0]):
+        for c in range(actions.shape[1]):
+            q, part = c // N_PLAN_STAGE, c % N_PLAN_STAGE
+            stage = N_PLAN_STAGE * min(q, last)
+            value = plans[j, stage + part]
+            if part < 3 and q > last:
+                value += (q - last) * dt * plans[j, stage + 3 + part]
+            actions[j, c] = min(max(value / PLAN_SCALE, -1.0), 1.0)
+
+
+@kernel
 def encode_decisions(
     commands: Array,
     plans: Array,
@@ -149,11 +180,11 @@ def encode_decisions(
     new_left: Counts,
     memory: Array,
 ) -> None:
-    """Commands and plans to actions, the episode's statistics brought up to date, the memory packed.
+    """Commands and plans to actions, the episode's statistics brought up to date, the memory joined.
 
     Args:
         commands: (n, 4), N.
-        plans: p relative to the present position and v for k+1..k+N, (n, 6 N); past its end it moves on.
+        plans: (n, 6 N), see `encode_plans`.
         fallback: (n,), how each was found.
         iterations: (n,).
         left: (n,), 1 where it left the validity of its model.
@@ -172,21 +203,9 @@ def encode_decisions(
         new_left: Output, (n,).
         memory: Output, (n, a + b).
     """
-    m = first.shape[1]
-    last = plans.shape[1] // N_PLAN_STAGE - 1
     encode_commands(
         commands, fallback, iterations, left, start, counts, worst, times_left, hover, force_max,
         actions[:, :4], new_counts, new_worst, new_left,
     )  # fmt: skip
-    for j in range(commands.shape[0]):
-        for c in range(actions.shape[1] - 4):
-            q, part = c // N_PLAN_STAGE, c % N_PLAN_STAGE
-            stage = N_PLAN_STAGE * min(q, last)
-            value = plans[j, stage + part]
-            if part < 3 and q > last:
-                value += (q - last) * dt * plans[j, stage + 3 + part]
-            actions[j, 4 + c] = min(max(value / PLAN_SCALE, -1.0), 1.0)
-        for i in range(m):
-            memory[j, i] = first[j, i]
-        for i in range(second.shape[1]):
-            memory[j, m + i] = second[j, i]
+    encode_plans(plans, dt, actions[:, 4:])
+    join_memory(first, second, memory)
