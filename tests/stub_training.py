@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from baselines import TrainingError
-from baselines.policies import network as networks
 from baselines.policies.network import Network
 from baselines.training.algorithms import ALGORITHMS, Algorithm
+from quad_envs.observations.features import default_features
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Progress(NamedTuple):
 def stub(task_options, options, seed, spent, start=None):
     """Each update draws another network around hover; after `fails_at` of them something happens."""
     task, rng, update = task_options.task, np.random.default_rng(seed), 0
-    features = networks.default_features(task.layout)
+    features = default_features(task.layout)
     while spent() < 1.0:
         update += 1
         if update == options.fails_at:

@@ -14,15 +14,9 @@ import pytest
 from baselines import CheckpointError, check_policy, evaluate, load_policy, make_policy, shipped_policies
 from baselines.policies.checkpoints import load_checkpoint, save_checkpoint
 from baselines.policies.environments import make_env, task_of
-from baselines.policies.network import (
-    Features,
-    Network,
-    NetworkPolicy,
-    default_features,
-    hover_actions,
-    hover_outputs,
-    hover_slopes,
-)
+from baselines.policies.network import Network, NetworkPolicy
+from quad_envs.encoding import hover_actions, hover_outputs, hover_slopes
+from quad_envs.observations.features import Features, default_features
 
 HELIX, FORMATION = "quad/HelixTracking-v0", "quad/Formation-v0"
 ABOUT = {"env_id": HELIX, "mission": "tracking", "algorithm": "apg", "kind": "model-based", "score": 0.5}
@@ -250,7 +244,7 @@ def endless(path):
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda folder: describe(folder, format=3), "has format 3, this version reads 1 to 2"),
+        (lambda folder: describe(folder, format=4), "has format 4, this version reads 1 to 3"),
         (
             lambda folder: describe(folder, mission="formation", env_id=FORMATION),
             "trained on 'quad/Formation",
@@ -381,3 +375,20 @@ def test_shipped_policies_go_by_name(saved, monkeypatch):
     monkeypatch.setattr("baselines.policies.trained.SHIPPED", saved.parent)
     assert shipped_policies() == {"run": "apg (model-based) on quad/HelixTracking-v0, score 0.500"}
     assert make_policy("run", HELIX).name == "run"
+
+
+def test_the_range_of_commands_is_a_part_of_a_checkpoint(tmp_path):
+    network = replace(network_for(), squash="clip", command_range=0.25)
+    save_checkpoint(tmp_path, network, {"env_id": HELIX})
+    policy, task = make_policy(tmp_path, HELIX), task_of(HELIX)
+    seen = np.concatenate([observations(), 50.0 * observations()])  # outputs reach the edges of their box
+    full = NetworkPolicy(replace(network, command_range=1.0), task, "full")
+    wanted = hover_actions(0.25 * hover_outputs(full.predict(seen)[0], task), task)
+    for found in (policy.predict(seen)[0], np.concatenate([policy.predict(row[None])[0] for row in seen])):
+        np.testing.assert_allclose(found, wanted, atol=2e-6)  # summed in another order
+    described = json.loads((tmp_path / "policy.json").read_text())
+    assert described["format"] == 3 and described["command_range"] == 0.25
+    with pytest.raises(
+        ValueError, match="command_range is a share of the hover force, above 0 and at most 1"
+    ):
+        replace(network, command_range=1.5)

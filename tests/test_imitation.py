@@ -7,12 +7,14 @@ import pytest
 
 from baselines import evaluate, make_policy, train
 from baselines.policies.environments import make_env, task_of
-from baselines.policies.network import Network, default_features, hover_actions
+from baselines.policies.network import Network
 from baselines.training.held_out import CHOOSING, HELD_OUT, training_options
 from baselines.training.imitation import DaggerOptions, LabelledFlights, Labels, make_expert
 from baselines.training.imitation import train as dagger
 from baselines.training.policy_gradient import PolicyGradientOptions
 from baselines.training.policy_gradient import train as policy_gradient
+from quad_envs.encoding import hover_actions
+from quad_envs.observations.features import default_features
 
 HELIX, RANDOM, FORMATION = "quad/HelixTracking-v0", "quad/RandomTracking-v0", "quad/Formation-v0"
 
@@ -38,7 +40,7 @@ def test_labels_are_what_the_expert_does_in_what_was_seen(env_id, expert, rows):
     # The expert asks for more than twice the hover force nowhere here, so that nothing is cut off.
     inside = np.abs(y) < 1.0
     assert np.allclose(hover_actions(y, flights.task)[inside], wanted[inside], atol=1e-6)
-    assert np.allclose(x * flights._scale + flights._mean, seen[:, flights._columns], atol=1e-5)
+    np.testing.assert_array_equal(x, flights.encoder.see(seen))
     assert len(x) == rows and 0.0 < reward < 1.0
 
 
@@ -107,7 +109,7 @@ def test_a_distance_without_a_team_or_below_its_own_is_refused(env_id, separatio
 def test_networks_do_not_see_slots_that_nobody_fills():
     options = training_options(FORMATION, {"formation": "hexagon"})  # each hears one other
     flights = LabelledFlights(options, make_policy("hover", options.task), 12, 0, (0, 2))
-    names = flights.features.names
+    names = flights.encoder.encoding.features.names
     assert {name.split("]")[0] for name in names if name.startswith("comm")} == {"comm[0"}
     assert {name.split("]")[0] for name in names if name.startswith("preview")} == {"preview[0", "preview[2"}
     seen = [name for name in default_features(options.task.layout, (0, 2)).names if name not in names]

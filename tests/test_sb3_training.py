@@ -16,7 +16,7 @@ import torch
 from baselines import evaluate
 from baselines.errors import TrainingError
 from baselines.policies.environments import make_env
-from baselines.policies.network import NetworkPolicy, hover_actions
+from baselines.policies.network import NetworkPolicy
 from baselines.training.lagrangian import (
     CostCritic,
     LagrangianBuffer,
@@ -39,6 +39,7 @@ from baselines.training.sb3 import (
     train_sac,
 )
 from baselines.training.vec_env import TrainingVecEnv
+from quad_envs.encoding import hover_actions
 from quad_envs.envs.team.options import EstimationOptions, FormationOptions, TargetTrackingOptions
 from quad_envs.envs.team.vector import TeamVectorEnv
 from quad_envs.envs.tracking.options import TrackingOptions
@@ -354,7 +355,7 @@ def test_an_exported_network_decides_as_the_learner_without_noise(algorithm):
         env = make_flights(options, small, 0)
         model = make_sac(env, small, 0, lambda: 0.0)
     model.learn(8 * 32)
-    policy = NetworkPolicy(export(model, env.features), env.task, "learned")
+    policy = NetworkPolicy(export(model, env.encoder.encoding), env.task, "learned")
     vector = TrackingVectorEnv(50)
     observations, _ = vector.reset(seed=0)
     observations += np.random.default_rng(0).normal(0.0, 0.5, observations.shape).astype(np.float32)

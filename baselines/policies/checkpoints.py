@@ -19,13 +19,14 @@ from typing import Any
 import numpy as np
 
 from quad_envs.names import shown
+from quad_envs.observations.features import Features
 
 from ..errors import CheckpointError, ResultsError
 from ..files import write_atomic
-from .network import Features, Network
+from .network import Network
 
-FORMAT = 2  # rises when an older suite could not read a checkpoint; 2: relu layers, cut features
-_OLDEST = 1  # that this version reads, and writes where that says all
+FORMAT = 3  # rises when an older suite could not read a checkpoint
+_OLDEST = 1  # that this version reads
 WEIGHTS, DESCRIPTION = "network.safetensors", "policy.json"
 _LARGEST = 50_000_000  # bytes; the networks here are a thousandth of it
 _PACKAGES = ("quad-envs", "numpy", "gymnasium", "torch", "stable-baselines3")
@@ -59,9 +60,9 @@ def save_checkpoint(folder: str | Path, network: Network, about: Mapping[str, An
     tensors = {}
     for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
         tensors[f"{k}.weight"], tensors[f"{k}.bias"] = np.ascontiguousarray(W), np.ascontiguousarray(b)
-    plain = network.activation == "tanh" and network.features.clip is None
+    number = _format_of(network)
     described = {
-        "format": _OLDEST if plain else FORMAT,
+        "format": number,
         "layers": [list(W.shape) for W in network.weights],
         "squash": network.squash,
         "commands": network.commands,
@@ -69,9 +70,10 @@ def save_checkpoint(folder: str | Path, network: Network, about: Mapping[str, An
             "names": list(network.features.names),
             "mean": list(network.features.mean),
             "scale": list(network.features.scale),
-            **({} if plain else {"clip": network.features.clip}),
+            **({"clip": network.features.clip} if number >= 2 else {}),
         },
-        **({} if plain else {"activation": network.activation}),
+        **({"activation": network.activation} if number >= 2 else {}),
+        **({"command_range": network.command_range} if number >= 3 else {}),
         "versions": versions(),
         **about,
     }
@@ -128,10 +130,18 @@ def load_checkpoint(folder: str | Path) -> tuple[Network, dict[str, Any]]:
             squash=described["squash"],
             commands=described["commands"],
             activation=described.get("activation", "tanh"),
+            command_range=float(described.get("command_range", 1.0)),
         )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise CheckpointError(f"{where} is not a valid network: {error}") from error
     return network, described
+
+
+def _format_of(network: Network) -> int:
+    """The lowest that says all of a network: 2 has relu layers and cut features, 3 a range of commands."""
+    if network.command_range != 1.0:
+        return 3
+    return 1 if network.activation == "tanh" and network.features.clip is None else 2
 
 
 def _open_at_once(path: str, flags: int) -> int:

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quad_envs.encoding import Encoder
+from quad_envs.observations.features import Features, entry_names
 from quad_envs.tasks import TeamTask
 
 from ..errors import CheckpointError
 from .checkpoints import DESCRIPTION, save_checkpoint
-from .environments import task_of
-from .network import Features, Network, Squash, entry_names
+from .environments import find_task, task_of
+from .network import Network, Squash
 from .normalisation import Normalisation, read_normalisation
-from .sb3_files import Actor, ModelFile
+from .sb3_files import Actor, ModelFile, saved_in_memory
 
 _NO_CUT = 1e15  # a clip that cuts nothing
 _KEPT_BY = ("Identity", "Flatten", "Dropout")  # torch modules that change nothing in flight
@@ -35,8 +36,9 @@ def export_policy(
     """Make a checkpoint of a network that was trained elsewhere, for `make_policy` and the command line.
 
     The actor alone is kept, without its noise: of `MlpPolicy` of PPO, A2C, SAC, TD3 or DDPG with tanh or relu
-    layers, or of a `torch.nn.Sequential` of Linear, Tanh and ReLU that gives the action. No code in the files
-    is run.
+    layers, or of a `torch.nn.Sequential` of Linear, Tanh and ReLU that gives the action. What
+    `quad_envs.wrappers.FilterAndRescale` did in training is a part of the checkpoint. No code in the files is
+    run.
 
     Args:
         source: Path of a zip that `model.save` of Stable-Baselines3 wrote, such a model, or a torch module.
@@ -61,18 +63,11 @@ def export_policy(
         raise CheckpointError(
             f"{str(path)!r} holds a checkpoint already; choose another folder, or fresh=True (--fresh)"
         )
-    task = None if env is None else task_of(env)
     actor = _actor_of(source)
+    task = None if env is None else _task_of(env, actor)
     features = _features(actor, task, _normalisation(actor, vecnormalize, mean, scale))
     try:
-        network = Network(
-            features,
-            actor.weights,
-            actor.biases,
-            squash=actor.squash,
-            commands="action",
-            activation=actor.activation,
-        )
+        network = _network_of(actor, features)
     except ValueError as error:
         raise CheckpointError(f"this network cannot become a checkpoint: {error}") from error
     about = {"algorithm": actor.algorithm, "kind": "model-free" if actor.algorithm else ""}
@@ -83,14 +78,33 @@ def export_policy(
     return path
 
 
+def _network_of(actor: Actor, features: Features) -> Network:
+    """The actor with what stands before and behind its layers."""
+    encoder = actor.encoder
+    return Network(
+        features,
+        actor.weights,
+        actor.biases,
+        squash=actor.squash,
+        commands="action" if encoder is None else "hover",
+        activation=actor.activation,
+        command_range=1.0 if encoder is None else encoder.encoding.command_range,
+    )
+
+
+def _task_of(env: Any, actor: Actor) -> Any:
+    """The task of an environment, which may be under the wrapper that the network was trained under."""
+    if actor.encoder is not None and not isinstance(env, str):
+        env = find_task(env) or env
+    return task_of(env)
+
+
 def _actor_of(source: Any) -> Actor:
     """Layers of whatever was given."""
     if isinstance(source, str | Path):
         return ModelFile(source).actor()
     if hasattr(source, "policy") and callable(getattr(source, "save", None)):
-        buffer = io.BytesIO()
-        source.save(buffer)
-        return ModelFile(buffer).actor()
+        return saved_in_memory(source).actor()
     return _module_actor(source)
 
 
@@ -163,6 +177,8 @@ def _normalisation(
 
 def _features(actor: Actor, task: Any, seen: Normalisation | None) -> Features:
     """Names of what the network sees, and its scaling."""
+    if actor.encoder is not None:
+        return _encoded_features(actor.encoder, task, seen)
     n = actor.weights[0].shape[0]
     names = [f"observation[{k}]" for k in range(n)]
     if task is not None:
@@ -178,6 +194,25 @@ def _features(actor: Actor, task: Any, seen: Normalisation | None) -> Features:
     # weight in that layer would be large numbers that cancel.
     return Features(
         tuple(names), tuple(seen.mean.tolist()), tuple(seen.scale.tolist()), min(seen.clip, _NO_CUT)
+    )
+
+
+def _encoded_features(encoder: Encoder, task: Any, seen: Normalisation | None) -> Features:
+    """Those of a wrapper, and what was done to them after it."""
+    features = encoder.encoding.features
+    if task is not None:
+        try:
+            features.columns(task.layout)
+        except ValueError as error:
+            raise CheckpointError(f"the network is of another task than {task.env_id}: {error}") from error
+    if seen is None:
+        return features
+    mean, scale = np.asarray(features.mean), np.asarray(features.scale)
+    return Features(
+        features.names,
+        tuple((mean + scale * seen.mean).tolist()),
+        tuple((scale * seen.scale).tolist()),
+        min(seen.clip, _NO_CUT),
     )
 
 

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_envs._numba import entry_of
+from quad_envs.encoding import Encoding, hover_actions, hover_gains
 from quad_envs.names import shown
-from quad_envs.observations.team import AgentLayout
-from quad_envs.observations.tracking import N_REFERENCE, TrackingLayout
+from quad_envs.observations.features import Features
 from quad_envs.parameters import Array
 from quad_envs.tasks import BaseTask, Task, TeamTask
 
@@ -28,113 +28,9 @@ Squash = Literal["tanh", "clip"]
 Activation = Literal["tanh", "relu"]
 Commands = Literal["hover", "action"]
 
-# Preview stages that a network sees: near ones densely, the horizon of the MPCs at the end.
-TRACKING_STAGES = (0, 1, 2, 3, 5, 7, 10, 14, 19, 25)
-PLACES = ("observation[0]",)  # how names of places begin, see `Features`
 _FEW = 4  # rows up to which the compiled form is faster
 _LARGEST_SEEN = 1e6  # SI, of an observation for which layers must not overflow
 _forward = entry_of(forward_rows)
-# Typical size of each part, so that a network sees numbers of order one.
-_SCALES = {
-    "V_B": 3.0,
-    "phi_theta": 0.5,
-    "sin_cos_psi": 1.0,
-    "Omega": 3.0,
-    "F": 2.0,
-    "last_command": 2.0,
-    "position": 2.0,
-    "disturbance": 0.5,
-    "role": 1.0,
-    "slot": 2.0,
-}
-_ROW_SCALES = {
-    "preview": (2.0, 2.0, 2.0, 3.0, 3.0, 3.0, 1.0, 1.0),
-    "sensed": (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0),
-    "measured": (1.0, 5.0, 1.0, 1.0, 1.0),
-    "estimate": (1.0, 2.0, 2.0, 2.0, 1.0, 1.0, 1.0, *(1.0,) * 6),
-    "comm": (10.0, 1.0, *(2.0,) * 3, *(1.0,) * 3, 0.5, 0.5, 1.0, 1.0, *(2.0,) * 3, *(2.0,) * 6),
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Features:
-    """Which entries of an observation a network sees, and how they are scaled: (obs - mean) / scale.
-
-    The entries are named, so that a network for 25 preview stages can fly where there are 30. Names
-    "observation[0]", "observation[1]", ... are places: of these a network sees all, where there are as many.
-    """
-
-    names: tuple[str, ...]  # "V_B[0]", "preview[5][2]", ...: part, then index in the part
-    mean: tuple[float, ...]
-    scale: tuple[float, ...]
-    clip: float | None = None  # largest size of what is scaled, as VecNormalize cuts it; None for none
-
-    def columns(self, layout: TrackingLayout | AgentLayout) -> NDArray[np.int64]:
-        """Indices in an observation of this layout.
-
-        Raises:
-            ValueError: If the layout lacks an entry; the message names it.
-        """
-        if self.names[:1] == PLACES[:1]:
-            if len(self.names) != layout.size:
-                raise ValueError(
-                    f"the network sees observations of {len(self.names)} numbers, here they have "
-                    f"{layout.size}: evaluate it in a task with the layout it was trained on"
-                )
-            return np.arange(layout.size)
-        known = {name: k for k, name in enumerate(entry_names(layout))}
-        missing = [name for name in self.names if name not in known]
-        if missing:
-            raise ValueError(
-                f"the network sees {missing[0]} (and {len(missing) - 1} more), which observations here "
-                "lack: evaluate it in a task with the layout it was trained on (preview, limits, slots)"
-            )
-        return np.array([known[name] for name in self.names], dtype=np.int64)
-
-
-def part_shapes(layout: TrackingLayout | AgentLayout) -> dict[str, tuple[int, ...]]:
-    """Name -> shape of the parts of an observation, in their order."""
-    if isinstance(layout, AgentLayout):
-        return layout.shapes
-    sizes = {name: part.stop - part.start for name, part in layout.slices.items() if name != "own"}
-    return {
-        name: (size // N_REFERENCE, N_REFERENCE) if name == "preview" else (size,)
-        for name, size in sizes.items()
-    }
-
-
-def entry_names(layout: TrackingLayout | AgentLayout) -> list[str]:
-    """A name for each entry of an observation."""
-    return [
-        name + "".join(f"[{i}]" for i in index)
-        for name, shape in part_shapes(layout).items()
-        for index in np.ndindex(*shape)
-    ]
-
-
-def preview_stages(preview: int) -> tuple[int, ...]:
-    """Stages of a preview that networks see."""
-    return tuple(stage for stage in TRACKING_STAGES if stage <= preview)
-
-
-def default_features(layout: TrackingLayout | AgentLayout, stages: tuple[int, ...] | None = None) -> Features:
-    """Everything but some preview stages, scaled to order one.
-
-    Args:
-        layout: Of the task.
-        stages: Preview stages to keep; None for `preview_stages`.
-    """
-    stages = preview_stages(layout.preview) if stages is None else stages
-    names, scale = [], []
-    for name, shape in part_shapes(layout).items():
-        row = _ROW_SCALES.get(name, (_SCALES.get(name, 1.0),))
-        for index in np.ndindex(*shape):
-            if name == "preview" and index[0] not in stages:
-                continue
-            names.append(name + "".join(f"[{i}]" for i in index))
-            scale.append(row[index[-1] % len(row)])
-    mean = [1.96 if name.startswith(("F[", "last_command[")) else 0.0 for name in names]
-    return Features(tuple(names), tuple(mean), tuple(scale))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,14 +46,16 @@ class Network:
     weights: tuple[Floats, ...]  # each (inputs, outputs)
     biases: tuple[Floats, ...]  # each (outputs,)
     squash: Squash = "tanh"  # how outputs come into [-1, 1]
-    commands: Commands = "hover"  # "hover": outputs are u_T (1 + output); "action": they are the actions
+    commands: Commands = "hover"  # outputs are forces about hover, or "action": they are the actions
     activation: Activation = "tanh"  # of all layers but the last
+    command_range: float = 1.0  # of outputs about hover, see `quad_envs.encoding.Encoding`
 
     def __post_init__(self) -> None:
         for name, kind in (("squash", Squash), ("commands", Commands), ("activation", Activation)):
             if getattr(self, name) not in get_args(kind):
                 allowed = " or ".join(map(repr, get_args(kind)))
                 raise ValueError(f"{name} of a network must be {allowed}, got {shown(getattr(self, name))}")
+        assert self.encoding  # it checks the range
         if not self.weights or len(self.weights) != len(self.biases):
             raise ValueError(
                 f"a network needs as many weights as biases, got {len(self.weights)} and {len(self.biases)}"
@@ -219,40 +117,14 @@ class Network:
         return [first, *zip(self.weights[1:], self.biases[1:], strict=True)]
 
     @property
+    def encoding(self) -> Encoding:
+        """What it sees, and what its outputs span."""
+        return Encoding(self.features, self.command_range)
+
+    @property
     def outputs(self) -> int:
         """Numbers that it gives."""
         return int(self.weights[-1].shape[1])
-
-
-def _hover_gain(task: BaseTask, dtype: Any) -> NDArray[Any]:
-    """Slope of `hover_actions` above hover, of each rotor, (4,)."""
-    return np.asarray(task.hover_force / (task.force_max - task.hover_force), dtype=dtype)
-
-
-def hover_actions(outputs: Floats, task: BaseTask) -> Floats:
-    """Actions that command u_T (1 + output) within the rotor box, for the first four outputs.
-
-    Outputs in [-1, 1] span 0 to m g / 2 per rotor: learning is faster than on the environments' own map,
-    whose upper half reaches to kappa m g.
-    """
-    out = outputs.copy()
-    rotors = out[..., :4]
-    np.copyto(rotors, np.minimum(np.where(rotors < 0.0, rotors, _hover_gain(task, out.dtype) * rotors), 1.0))
-    return out
-
-
-def hover_slopes(outputs: Floats, task: BaseTask) -> Array:
-    """Derivative of `hover_actions` by each of four outputs; 0 where the rotor box cuts."""
-    gain = _hover_gain(task, np.float64)
-    return np.where(outputs < 0.0, 1.0, np.where(gain * outputs < 1.0, gain, 0.0))
-
-
-def hover_outputs(actions: Floats, task: BaseTask) -> Floats:
-    """The outputs of which `hover_actions` makes these actions, within [-1, 1]."""
-    out = actions.copy()
-    rotors = out[..., :4]
-    np.copyto(rotors, np.minimum(np.where(rotors < 0.0, rotors, rotors / _hover_gain(task, out.dtype)), 1.0))
-    return out
 
 
 class NetworkPolicy:
@@ -289,7 +161,8 @@ class NetworkPolicy:
         self._scaling = _scaling(network.features)
         self._kinds = np.array([network.activation == "relu", network.squash == "tanh"])
         hover = network.commands == "hover"
-        self._gain = _hover_gain(task, np.float32) if hover else np.ones(4, dtype=np.float32)
+        ones = np.ones((2, 4), dtype=np.float32)
+        self._gains = hover_gains(task, network.command_range, np.float32) if hover else ones
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.name!r}, {self.task.env_id!r})"
@@ -322,7 +195,7 @@ class NetworkPolicy:
         out = np.empty((len(obs), self._sizes[-1]), dtype=np.float32)
         work = np.empty((2, self._sizes.max()), dtype=np.float32)
         layers = self._sizes, self._flat, self._kinds
-        bad = _forward(obs, self._columns, self._scaling, *layers, self._gain, work, out)
+        bad = _forward(obs, self._columns, self._scaling, *layers, self._gains, work, out)
         if bad >= 0:
             raise not_finite(obs, bad, self.task.layout.slices)
         return out
@@ -344,7 +217,8 @@ class NetworkPolicy:
             elif k + 1 < len(self._layers) or self.network.squash == "tanh":
                 np.tanh(x, out=x)
         np.clip(x, -1.0, 1.0, out=x)
-        return hover_actions(x, self.task) if self.network.commands == "hover" else x
+        hover = self.network.commands == "hover"
+        return hover_actions(x, self.task, self.network.command_range) if hover else x
 
 
 def _scaling(features: Features) -> Array:

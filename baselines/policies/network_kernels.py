@@ -39,7 +39,7 @@ def forward_rows(
     sizes: Ints,
     weights: Floats,
     kinds: NDArray[np.bool_],
-    gain: Floats,
+    gains: Floats,
     work: Floats,
     out: Floats,
 ) -> int:
@@ -54,7 +54,8 @@ def forward_rows(
         weights: Row by row the weights of a layer, then its biases, layer after layer.
         kinds: Whether layers but the last are relu and not tanh; whether the outputs pass a tanh before they
             are clipped to [-1, 1], (2,).
-        gain: By which positive outputs of the first four are scaled, (4,), see `networks.hover_actions`.
+        gains: Slopes of the actions by the first four outputs, below zero and above, (2, 4), see
+            `quad_envs.encoding.hover_gains`.
         work: Scratch, (2, max(sizes)).
         out: Result, (n, sizes[-1]).
 
@@ -86,7 +87,7 @@ def forward_rows(
             at += (n + 1) * m
         for j in range(sizes[layers]):
             answer = min(max(work[layers % 2, j], np.float32(-1.0)), np.float32(1.0))
-            if j < 4 and answer > 0.0:
-                answer = min(answer * gain[j], np.float32(1.0))
+            if j < 4:
+                answer = min(answer * gains[0 if answer < 0.0 else 1, j], np.float32(1.0))
             out[r, j] = answer
     return -1

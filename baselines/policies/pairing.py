@@ -10,6 +10,7 @@ import gymnasium
 
 from quad_envs.names import shown
 from quad_envs.tasks import BaseTask
+from quad_envs.wrappers.vector import FilterAndRescale
 
 from .environments import find_task
 
@@ -18,6 +19,7 @@ _REWRITERS = (
     gymnasium.ActionWrapper,
     gymnasium.vector.VectorObservationWrapper,
     gymnasium.vector.VectorActionWrapper,
+    FilterAndRescale,
 )
 _HARMLESS = (
     gymnasium.wrappers.FlattenObservation,

@@ -18,7 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_envs.encoding import Encoder
 from quad_envs.names import shown
+from quad_envs.wrappers.encoded_space import EncodedBox, encoder_of
 
 from ..errors import CheckpointError, MissingPackageError
 from .network import Activation, Squash
@@ -36,6 +38,7 @@ class Actor(NamedTuple):
     activation: Activation
     squash: Squash  # of the outputs
     algorithm: str = ""
+    encoder: Encoder | None = None  # what the wrapper that it was trained under did
 
 
 class ModelFile:
@@ -112,7 +115,7 @@ class ModelFile:
         for name in ("observation_space", "action_space"):
             space = self.data[name]
             kind = str(space.get(":type:", "")) if isinstance(space, Mapping) else str(space)
-            if not kind.endswith(".Box'>"):
+            if not kind.endswith((".Box'>", f".{EncodedBox.__name__}'>")):
                 raise CheckpointError(
                     f"{self.where} is of another task: its {name} is {shown(kind)}, and not a Box of one row"
                 )
@@ -136,6 +139,30 @@ class ModelFile:
         if len(shape) != 1:
             raise CheckpointError(f"{self.where} is of another task: its {space} has shape {shown(shape)}")
         return int(shape[0])
+
+    @property
+    def encoder(self) -> Encoder | None:
+        """What the wrapper that it was trained under did; None where there was none.
+
+        Raises:
+            CheckpointError: If its observation space does not say it as that wrapper does.
+        """
+        said = self.data["observation_space"].get("encoding")
+        if said is None:
+            return None
+        try:
+            found = encoder_of(said)
+        except (KeyError, TypeError, ValueError) as error:
+            raise CheckpointError(
+                f"{self.where}: the encoding in its observation_space is not that of "
+                f"quad_envs.wrappers.FilterAndRescale: {error!r}"
+            ) from error
+        if found.size != self.size("observation_space"):
+            raise CheckpointError(
+                f"{self.where}: its encoding has {found.size} features, its observation_space "
+                f"{self.size('observation_space')}: no other wrapper may stand above FilterAndRescale"
+            )
+        return found
 
     @property
     def algorithm(self) -> str:
@@ -177,7 +204,9 @@ class ModelFile:
         activation = default if "activation_fn" not in kwargs else _ACTIVATIONS.get(said[1] if said else "")
         if activation is None:
             raise self._other(f"its activation_fn is {shown(kwargs['activation_fn'])}")
-        return Actor(weights, biases, activation, "clip" if on_policy else "tanh", self.algorithm)
+        return Actor(
+            weights, biases, activation, "clip" if on_policy else "tanh", self.algorithm, self.encoder
+        )
 
     def _layers(self, tensors: Mapping[str, NDArray[Any]]) -> tuple[tuple[Floats, ...], tuple[Floats, ...]]:
         """Weights and biases of the actor, from the observation on."""
@@ -225,6 +254,21 @@ class ModelFile:
             f"{self.where} cannot become a checkpoint of layers: {why}; MlpPolicy of PPO, A2C, SAC, TD3 and "
             "DDPG with Tanh or ReLU can. baselines.sb3 flies others, if you trust the file"
         )
+
+
+def saved_in_memory(model: Any) -> ModelFile:
+    """What `model.save` would write of a model.
+
+    Raises:
+        CheckpointError: If it is no model of Stable-Baselines3, or as `ModelFile` says.
+    """
+    if not (hasattr(model, "policy") and callable(getattr(model, "save", None))):
+        raise CheckpointError(
+            f"expected a model of Stable-Baselines3, or the path of one, got {shown(model)}"
+        )
+    buffer = io.BytesIO()
+    model.save(buffer)
+    return ModelFile(buffer)
 
 
 def _release(version: str) -> tuple[int, ...]:

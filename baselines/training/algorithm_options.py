@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 _POSITIVE = (
     *("n_envs", "n_steps", "progress_steps", "batch_size", "n_epochs", "learning_rate", "final_rate"),
-    *("gamma", "clip_range", "max_grad_norm", "train_freq", "gradient_steps", "buffer_size", "tau", "probes"),
+    *("gamma", "clip_range", "max_grad_norm", "command_range", "train_freq", "gradient_steps"),
+    *("buffer_size", "tau", "probes"),
 )
 # Hyperparameters that take memory or time, and the largest that make sense.
 _MOST = {
@@ -33,7 +34,7 @@ _MOST = {
 }
 _MAY_BE_NONE = ("gradient_steps", "final_gradient_steps", "critic_updates", "learning_starts")
 _WIDEST, _MOST_LAYERS = 10_000, 20
-_SHARES = ("free", "final_rate", "gamma", "gae_lambda", "tau")
+_SHARES = ("free", "final_rate", "gamma", "gae_lambda", "tau", "command_range")
 _WEIGHTS = ("vf_coef",)  # that may be zero
 _AUTO = re.compile(r"auto(_(?=[0-9.]*[1-9])[0-9]*\.?[0-9]+(e-?[0-9]+)?)?")
 
@@ -96,6 +97,7 @@ class PpoOptions:
     max_grad_norm: float = 0.5  # to which gradients are clipped
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers, of policy and critic alike
     stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for the usual ones
+    command_range: float = 1.0  # largest change of a rotor force, as a share of its force in hover
     episode_steps: int | None = None  # of a flight in training; None for the task's own
     critic_updates: int = 5  # of the critic alone, where training goes on from a policy
 
@@ -131,6 +133,7 @@ class SacOptions:
     ent_coef: float | str = "auto_0.01"  # weight of the entropy; "auto_0.01" learns it, from 0.01
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers, of policy and critics alike
     stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for the usual ones
+    command_range: float = 1.0  # largest change of a rotor force, as a share of its force in hover
     episode_steps: int | None = None  # of a flight in training; None for the task's own
     progress_steps: int = 64  # of each flight between two looks at the policy
 

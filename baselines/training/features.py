@@ -8,8 +8,7 @@ from quad_envs.envs.team.options import TeamOptions
 from quad_envs.envs.tracking.options import TrackingOptions
 from quad_envs.graphs import in_neighbours
 from quad_envs.names import shown
-
-from ..policies.network import Features, default_features
+from quad_envs.observations.features import Features, default_features
 
 
 def training_features(

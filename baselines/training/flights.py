@@ -26,10 +26,9 @@ from quad_envs.envs.tracking.kernel import (
     task_vector,
 )
 from quad_envs.envs.tracking.options import TrackingOptions
+from quad_envs.observations.features import Features, default_features, preview_stages
 from quad_envs.observations.tracking import N_REFERENCE
 from quad_envs.parameters import Array
-
-from ..policies.network import Features, default_features, preview_stages
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float32]

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from quad_envs.encoding import Encoder, Encoding, hover_outputs
 from quad_envs.envs.team.options import TeamOptions
 from quad_envs.envs.team.vector import TeamVectorEnv
 from quad_envs.envs.tracking.options import TrackingOptions
@@ -22,7 +23,7 @@ from quad_envs.tasks import BaseTask, TeamTask
 
 from ..errors import TrainingError
 from ..evaluation.rollout import is_privileged
-from ..policies.network import Floats, Network, NetworkPolicy, hover_outputs
+from ..policies.network import Floats, Network, NetworkPolicy
 from ..policies.protocol import Policy
 from ..policies.registry import make_policy
 from .algorithm_options import DaggerOptions
@@ -64,12 +65,8 @@ class LabelledFlights:
             given = {field.name: getattr(options, field.name) for field in fields(options) if field.init}
             self.env = TrackingVectorEnv(count, **given)
         self.task: BaseTask = self.env.task
-        self.features = training_features(options, stages)
+        self.encoder = Encoder(Encoding(training_features(options, stages)), self.task)
         self.outputs = self.task.action_size if isinstance(self.task, TeamTask) else 4
-        self._columns = self.features.columns(self.env.task.layout)
-        self._mean, self._scale = (
-            np.array(part, dtype=np.float32) for part in (self.features.mean, self.features.scale)
-        )
         sequence = np.random.SeedSequence([_STREAM, seed])
         self._rng = np.random.default_rng(sequence)
         self._expert = expert
@@ -97,7 +94,7 @@ class LabelledFlights:
                 by_expert, labels, flier.predict(self._observations)[0]
             )  # fmt: skip
             flies = ~self._done  # a row that is done begins anew in this step, whatever the action
-            seen.append((self._observations[flies][:, self._columns] - self._mean) / self._scale)
+            seen.append(self.encoder.see(self._observations[flies]))
             wanted.append(hover_outputs(labels[flies], self.task))
             self._observations, reward, terminated, truncated, _ = self.env.step(actions)
             rewards.append(reward[flies])
@@ -193,7 +190,7 @@ def train(
             )
         task_options = replace(task_options, max_cycles=options.episode_steps)
     flights = LabelledFlights(task_options, expert, options.n_envs, seed, options.stages)
-    features, outputs = flights.features, flights.outputs
+    features, outputs = flights.encoder.encoding.features, flights.outputs
     actor = Actor(len(features.names), options.net_arch, outputs, options.squash)
     if start is not None:
         actor.load(start, features)

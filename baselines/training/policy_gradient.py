@@ -14,10 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from quad_envs.encoding import hover_actions, hover_slopes
 from quad_envs.envs.tracking.options import TrackingOptions
+from quad_envs.observations.features import Features
 
 from ..errors import TrainingError
-from ..policies.network import Features, Floats, Network, Squash, hover_actions, hover_slopes
+from ..policies.network import Floats, Network, Squash
 from .algorithm_options import PolicyGradientOptions
 from .flights import DifferentiableFlights
 from .held_out import Progress
@@ -62,7 +64,8 @@ class Actor:
         import torch
 
         shapes = [tuple(layer.weight.shape[::-1]) for layer in self.layers]
-        kinds, own = (network.squash, network.activation), (self.squash, "tanh")
+        kinds = (network.squash, network.activation, str(network.command_range))
+        own = (self.squash, "tanh", "1.0")
         if [W.shape for W in network.weights] != shapes or kinds != own:
             raise ValueError(
                 f"cannot go on from layers {[W.shape for W in network.weights]} ({', '.join(kinds)}) with "

@@ -18,10 +18,11 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
 
+from quad_envs.encoding import Encoding
 from quad_envs.envs.team.options import TeamOptions
 
 from ..errors import TrainingError
-from ..policies.network import Features, Network
+from ..policies.network import Network
 from .algorithm_options import PpoLagrangianOptions, PpoOptions, SacOptions
 from .features import training_features
 from .held_out import Progress
@@ -124,11 +125,11 @@ def make_flights(
             no rotor commands.
     """
     size = task_options.vehicles if isinstance(task_options, TeamOptions) else 1
-    features = training_features(task_options, options.stages)
+    encoding = Encoding(training_features(task_options, options.stages), options.command_range)
     if start is not None:
-        features = start.features
+        encoding = start.encoding
     n = max(1, options.n_envs // size)
-    return TrainingVecEnv(task_options, n, seed, features=features, episode_steps=options.episode_steps)
+    return TrainingVecEnv(task_options, n, seed, encoding=encoding, episode_steps=options.episode_steps)
 
 
 def make_ppo(
@@ -188,19 +189,20 @@ def _arguments(
     return same | {"learning_rate": _falling(options.learning_rate, options.final_rate, spent)}
 
 
-def export(model: PPO | SAC, features: Features) -> Network:
+def export(model: PPO | SAC, encoding: Encoding) -> Network:
     """The policy without its noise.
 
     Args:
         model: With tanh layers.
-        features: That it sees.
+        encoding: Of what it sees and commands.
     """
     layers = _policy_layers(model)
     return Network(
-        features,
+        encoding.features,
         tuple(np.ascontiguousarray(layer.weight.detach().numpy().T) for layer in layers),
         tuple(layer.bias.detach().numpy().copy() for layer in layers),
         squash="tanh" if isinstance(model, SAC) else "clip",
+        command_range=encoding.command_range,
     )
 
 
@@ -272,7 +274,7 @@ def _updates(
         if bound is not None and isinstance(options, PpoLagrangianOptions) and spent() >= options.free:
             multiplier, probe = bound
             multiplier.update(probe.share(model, steps))
-        yield Progress(update, model.num_timesteps, tally.reward), export(model, flights.features)
+        yield Progress(update, model.num_timesteps, tally.reward), export(model, flights.encoder.encoding)
 
 
 def _unsound(model: PPO | SAC) -> str | None:

@@ -17,15 +17,17 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
+from quad_envs.encoding import Encoder, Encoding
 from quad_envs.envs.team.batch import TeamBatch
 from quad_envs.envs.team.options import TeamOptions
 from quad_envs.envs.tracking.batch import TrackingBatch
 from quad_envs.envs.tracking.kernel import COST, CRASHED, REWARD, TRUNCATED, VIOLATED
 from quad_envs.envs.tracking.options import TrackingOptions
 from quad_envs.names import shown
+from quad_envs.observations.features import Features, default_features
 from quad_envs.tasks import Task, TeamTask
 
-from ..policies.network import Features, Floats, default_features, hover_actions
+from ..policies.network import Floats
 
 Bools = NDArray[np.bool_]
 TaskOptions = TrackingOptions | TeamOptions
@@ -52,7 +54,7 @@ class TrainingVecEnv(VecEnv):
         n: Number of flights or teams.
         seed: One number, from which starts are drawn that no seed of an environment gives; or such a seed
             for each flight or team.
-        features: What the network sees; None for all that `default_features` keeps.
+        encoding: What the network sees and commands; None for the default features and the full range.
         staggered: Whether the first episodes are cut at random, so that flights are at all times of the
             episode from then on. A cut counts as a truncation.
         episode_steps: After which an episode is cut, if the task's is longer: short ones see more starts.
@@ -69,7 +71,7 @@ class TrainingVecEnv(VecEnv):
         n: int,
         seed: int | Sequence[int] = 0,
         *,
-        features: Features | None = None,
+        encoding: Encoding | None = None,
         staggered: bool = True,
         episode_steps: int | None = None,
     ) -> None:
@@ -86,10 +88,7 @@ class TrainingVecEnv(VecEnv):
                 f"actions of {self.task.env_id} are estimates, and this trains networks that command rotors: "
                 "choose quad/TargetTracking-v0 or a tracking task"
             )
-        self.features = features or default_features(self.task.layout)
-        self._columns = self.features.columns(self.task.layout)
-        self._mean = np.asarray(self.features.mean, dtype=np.float32)
-        self._rate = (1.0 / np.asarray(self.features.scale)).astype(np.float32)
+        self.encoder = Encoder(encoding or Encoding(default_features(self.task.layout)), self.task)
         rows = n * self._size
         self._out = np.empty((rows, self.task.layout.size), dtype=np.float32)
         self._actions = np.zeros((rows, self.action_size), dtype=np.float32)
@@ -102,7 +101,7 @@ class TrainingVecEnv(VecEnv):
         self._steps, self._reward, self._violations = 0, 0.0, 0
         super().__init__(
             rows,
-            spaces.Box(-np.inf, np.inf, (self._columns.size,), np.float32),
+            spaces.Box(-np.inf, np.inf, (self.encoder.size,), np.float32),
             spaces.Box(-1.0, 1.0, (self.action_size,), np.float32),
         )
         self.seed(seed)
@@ -111,6 +110,11 @@ class TrainingVecEnv(VecEnv):
     def task(self) -> Task | TeamTask:
         """What is known of the task before the flight."""
         return self._batch.task
+
+    @property
+    def features(self) -> Features:
+        """What the network sees."""
+        return self.encoder.encoding.features
 
     @property
     def action_size(self) -> int:
@@ -141,7 +145,7 @@ class TrainingVecEnv(VecEnv):
 
     def step_async(self, actions: Floats) -> None:
         """Take the network's outputs, (rows, action size), in [-1, 1]."""
-        self._actions = np.ascontiguousarray(hover_actions(actions, self.task), dtype=np.float32)
+        self._actions = np.ascontiguousarray(self.encoder.act(actions))
 
     def step_wait(self) -> tuple[Floats, Floats, Bools, list[dict[str, Any]]]:
         """One control period of all rows.
@@ -191,10 +195,7 @@ class TrainingVecEnv(VecEnv):
             self._batch.reset_row(group, self._generators[group], self._out[group])
 
     def _scaled(self, observations: Floats) -> Floats:
-        out: Floats = np.take(observations, self._columns, axis=1)
-        out -= self._mean
-        out *= self._rate
-        return out
+        return self.encoder.see(observations)
 
     def close(self) -> None:
         """There is nothing to close."""
