@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from controllers.estimation import ekf
+from controllers.estimation import Measurements, ekf
 from controllers.estimation.consistency import nees
 from controllers.estimation.kalman import kalman_update
 from quad_envs.rotations import wrap_angle
@@ -117,7 +117,7 @@ def fly(truth, state, predict, rows, held=held, fuse=None, update=ekf.update):
         z = np.repeat(truth.z[k], 4, axis=0)
         places = np.tile(truth.vehicles[k], (4 * runs, 1, 1))
         valid = np.tile(held(k), (runs, 1))
-        state, innovation = update(predict(state), z, places, None, valid, SIGMA, rows)
+        state, innovation = update(predict(state), Measurements(z, places, None, valid, SIGMA, rows))
         state = fuse(state) if fuse else state
         error = state.x[:, :3] - np.repeat(truth.target[k, :, :3], 4, axis=0)
         parts.append((*state, error, innovation.nis, innovation.rows))
@@ -212,7 +212,7 @@ def sweep(path, runs, rng, overhead=True, wrap=True):
         z = range_azimuth_elevation(path[k]) + SIGMA * rng.normal(size=(runs, 1, 3))
         z[..., 1] = wrap_angle(z[..., 1])
         place = np.tile(vehicle, (runs, 1, 1))
-        mine, _ = ekf.update(ekf.predict(mine, DT, 0.2), z, place, None, None, SIGMA, 3)
+        mine, _ = ekf.update(ekf.predict(mine, DT, 0.2), Measurements(z, place, None, None, SIGMA, 3))
         other = ekf.predict(other, DT, 0.2)
         parts = [rows_of(other.x[i], z[i], vehicle, [0.0], 3, wrap, overhead) for i in range(runs)]
         nu, H, variance = (np.array(part) for part in zip(*parts, strict=True))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from baselines import make_policy
-from controllers.estimation import ekf
+from controllers.estimation import Measurements, ekf
 from controllers.estimation.consistency import information
 from quad_envs import cooperative_estimation_v0, target_tracking_v0
 from quad_envs.sensors import jacobian, range_azimuth_elevation, sensor_rows
@@ -37,9 +37,10 @@ def test_an_update_is_the_formula_of_kalman_with_a_wrapped_azimuth_and_reads_no_
     S = H @ P @ H.T + 0.02**2 * np.eye(2)
     K = P @ H.T @ np.linalg.inv(S)
     new, said = ekf.update(
-        ekf.TargetFilter(x[None], P[None]), z[None, None], np.zeros((1, 1, 3)), None, None, SIGMA,
-        sensor_rows(BEARINGS), None,
-    )  # fmt: skip
+        ekf.TargetFilter(x[None], P[None]),
+        Measurements(z[None, None], np.zeros((1, 1, 3)), None, None, SIGMA, sensor_rows(BEARINGS)),
+        restart=None,
+    )
     np.testing.assert_allclose(new.x[0], x + K @ nu, atol=1e-7)
     np.testing.assert_allclose(new.P[0], P - K @ S @ K.T, atol=1e-7)
     assert (said.nis[0], said.rows[0]) == (pytest.approx(nu @ np.linalg.solve(S, nu), rel=1e-5), 2)
@@ -50,7 +51,9 @@ def test_a_lost_filter_begins_anew_where_lines_of_sight_meet():
     places = np.array([[0.0, 0.0, 0.0], [4.0, 0.0, -1.0], [0.0, 4.0, 1.0]])
     z = range_azimuth_elevation(target - places)
     lost = ekf.TargetFilter(np.array([[-9.0, 2.0, 4.0, 0.0, 0.0, 0.0]]), 0.01 * np.eye(6)[None])
-    new, said = ekf.update(lost, z[None], places[None], None, None, SIGMA, sensor_rows(BEARINGS))
+    new, said = ekf.update(
+        lost, Measurements(z[None], places[None], None, None, SIGMA, sensor_rows(BEARINGS))
+    )
     assert said.restarted[0]
     np.testing.assert_allclose(new.x[0, :3], target, atol=1e-6)
 
@@ -101,7 +104,9 @@ def test_one_vehicle_alone_does_not_see_the_distance():
     z = range_azimuth_elevation(np.array([[6.0, 0.0, 0.0]]))
     state = ekf.initial_filter(np.array([[4.0, 0.0, 0.0]]), (0.0, 0.0, 0.0), (3.0, 1.0))
     for _ in range(50):
-        state, _ = ekf.update(state, z[None], alone[None], None, None, SIGMA, sensor_rows(BEARINGS))
+        state, _ = ekf.update(
+            state, Measurements(z[None], alone[None], None, None, SIGMA, sensor_rows(BEARINGS))
+        )
     assert state.P[0, 0, 0] > 8.9 and max(state.P[0, 1, 1], state.P[0, 2, 2]) < 0.01
 
 

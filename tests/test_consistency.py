@@ -142,8 +142,8 @@ def test_the_filter_is_consistent_with_three_ranges_from_the_start(vehicle, unti
     assert 0.8 < range_only().anees(vehicle, part) < 1.2
 
 
-def first_order(state, z, position, age, valid, sigma, rows):
-    return ekf.update(state, z, position, age, valid, sigma, rows, None, second_order=False)
+def first_order(state, measured):
+    return ekf.update(state, measured, restart=None, second_order=False)
 
 
 def too_sure(runs, vehicle, interval):
@@ -161,9 +161,10 @@ def test_the_second_order_makes_filters_with_two_ranges_less_sure_of_a_wrong_pla
     assert (after <= before).all() and after.mean() < 0.6 * before.mean()
 
 
-def by_trilateration(state, z, position, age, valid, sigma, rows):
+def by_trilateration(state, measured):
     """The EKF, but where four ranges are held a fix enters as a position measurement."""
-    new, innovation = ekf.update(state, z, position, age, valid, sigma, rows)
+    z, position, _, valid, sigma, _ = measured
+    new, innovation = ekf.update(state, measured)
     fix = trilaterate(position, z[..., 0], sigma[0], valid, start=state.x[:, :3])
     use = np.flatnonzero(fix.accepted)
     if len(use):
@@ -195,7 +196,8 @@ def test_a_fix_alone_forgets_what_the_filter_knows(interval, rmse, consistency):
 def squared_range(constant):
     """An update with z = rho^2: with its own noise and the bias removed, or with constant noise (6.3)."""
 
-    def update(state, z, position, age, valid, sigma, rows):
+    def update(state, measured):
+        z, position, _, valid, sigma, _ = measured
         d = state.x[:, None, :3] - position
         rho2, s2 = (d**2).sum(-1), sigma[0] ** 2
         mask = valid[..., None]
@@ -221,8 +223,8 @@ def test_a_squared_range_with_constant_noise_is_hopelessly_sure():
 
 
 def test_a_gain_without_measurement_noise_diverges():
-    def update(state, z, position, age, valid, sigma, rows):
-        return ekf.update(state, z, position, age, valid, 1e-4 * np.asarray(sigma), rows, None)
+    def update(state, measured):
+        return ekf.update(state, measured._replace(sigma=1e-4 * np.asarray(measured.sigma)), restart=None)
 
     runs = fly(*scenario(), predict, 1, update=update)
     assert runs.anees(0, LATE) > 1e4 and runs.rmse(0, EARLY) > 2.0 * range_only().rmse(0, EARLY)
@@ -316,9 +318,9 @@ def fuse(weights):
     return fused
 
 
-def never_restarting(*arguments):
+def never_restarting(state, measured):
     """The bare filter: restarts would bring a fusion back that counts twice."""
-    return ekf.update(*arguments, None)
+    return ekf.update(state, measured, restart=None)
 
 
 @functools.cache

@@ -17,7 +17,7 @@ from estimation_runs import (
 )
 from filterpy.kalman import ExtendedKalmanFilter
 
-from controllers.estimation import ekf
+from controllers.estimation import Measurements, ekf
 from controllers.estimation.ekf_kernels import ekf_scratch, ekf_step_kernel
 from controllers.estimation.kalman import kalman_update
 from quad_envs.rotations import wrap_angle
@@ -40,7 +40,7 @@ def some_measurements(n, m, rng):
 def test_the_update_agrees_with_its_readable_twin(rows):
     rng = np.random.default_rng(0)
     state, (z, position, age, valid) = some_filters(30, rng), some_measurements(30, 4, rng)
-    new, innovation = ekf.update(state, z, position, age, valid, SIGMA, rows)
+    new, innovation = ekf.update(state, Measurements(z, position, age, valid, SIGMA, rows))
     for i in range(30):
         j = valid[i]
         if not j.any():
@@ -113,7 +113,7 @@ def test_a_delayed_measurement_agrees_with_the_augmented_filter():
     z = range_azimuth_elevation(START[:3] - position)[None]
     H = np.concatenate([np.zeros((1, 3, 6)), jacobian(d), np.zeros((1, 3, 3))], axis=2)
     exact = kalman_update(both, joint, z - range_azimuth_elevation(d), H, np.diag(SIGMA**2)[None])
-    mine, _ = ekf.update(now, z[:, None], position[None, None], [[age]], None, SIGMA, 3)
+    mine, _ = ekf.update(now, Measurements(z[:, None], position[None, None], [[age]], None, SIGMA, 3))
     np.testing.assert_allclose(mine.x, exact.x[:, :6], atol=1e-12)
     np.testing.assert_allclose(mine.P, exact.P[:, :6, :6], atol=1e-12)
 
@@ -127,9 +127,9 @@ def test_a_moving_origin_changes_nothing():
         z, position, age, valid = some_measurements(8, 3, rng)
         step = rng.normal(size=(8, 3))
         origin = origin + step
-        fixed, _ = ekf.update(ekf.predict(fixed, DT, 0.1), z, position, age, valid, SIGMA, 3)
+        fixed, _ = ekf.update(ekf.predict(fixed, DT, 0.1), Measurements(z, position, age, valid, SIGMA, 3))
         moving = ekf.shift(ekf.predict(moving, DT, 0.1), step)
-        moving, _ = ekf.update(moving, z, position - origin[:, None], age, valid, SIGMA, 3)
+        moving, _ = ekf.update(moving, Measurements(z, position - origin[:, None], age, valid, SIGMA, 3))
     np.testing.assert_allclose(moving.x[:, :3] + origin, fixed.x[:, :3], atol=1e-9)
     np.testing.assert_allclose(moving.P, fixed.P, atol=1e-9)
 
@@ -139,7 +139,7 @@ def test_the_compiled_step_is_predict_shift_update():
     state, (z, position, age, valid) = some_filters(4, rng), some_measurements(4, 3, rng)
     displacement = rng.normal(size=(4, 3))
     new, innovation = ekf.update(
-        ekf.shift(ekf.predict(state, DT, 0.1), displacement), z, position, age, valid, SIGMA, 3
+        ekf.shift(ekf.predict(state, DT, 0.1), displacement), Measurements(z, position, age, valid, SIGMA, 3)
     )
     restart = ekf.Restart().data()
     for i in range(4):
@@ -168,7 +168,7 @@ def test_without_measurement_the_prediction_stays():
         (z, position, age, np.zeros((3, 2))),
         (z[:, :0], position[:, :0], age[:, :0], np.zeros((3, 0))),
     ):
-        new, innovation = ekf.update(state, *arguments, SIGMA, 3)
+        new, innovation = ekf.update(state, Measurements(*arguments, SIGMA, 3))
         np.testing.assert_array_equal(new.x, state.x)
         np.testing.assert_array_equal(new.P, state.P)
         assert not innovation.rows.any() and not innovation.nis.any() and not innovation.rejected.any()
@@ -190,9 +190,11 @@ def test_a_measurement_that_is_not_finite_is_left_out_and_counted(fault, where):
     state, (z, position, age, _) = some_filters(2, rng), some_measurements(2, 3, rng)
     broken = {"z": z.copy(), "position": position.copy(), "age": age.copy()}
     broken[where][1, 1] = fault
-    new, innovation = ekf.update(state, broken["z"], broken["position"], broken["age"], None, SIGMA, 3)
+    new, innovation = ekf.update(
+        state, Measurements(broken["z"], broken["position"], broken["age"], None, SIGMA, 3)
+    )
     valid = np.array([[True, True, True], [True, False, True]])
-    expected, _ = ekf.update(state, z, position, age, valid, SIGMA, 3)
+    expected, _ = ekf.update(state, Measurements(z, position, age, valid, SIGMA, 3))
     np.testing.assert_array_equal(new.x, expected.x)
     np.testing.assert_array_equal(innovation.rejected, [0, 1])
 
@@ -201,7 +203,7 @@ def test_angles_of_a_range_sensor_are_not_read():
     rng = np.random.default_rng(12)
     state, (z, position, age, _) = some_filters(2, rng), some_measurements(2, 3, rng)
     z[..., 1:] = np.nan
-    _, innovation = ekf.update(state, z, position, age, None, SIGMA, 1)
+    _, innovation = ekf.update(state, Measurements(z, position, age, None, SIGMA, 1))
     np.testing.assert_array_equal(innovation.rows, 3)
 
 
@@ -209,7 +211,7 @@ def test_an_indefinite_covariance_rejects_the_measurement_instead_of_the_state()
     rng = np.random.default_rng(13)
     state, (z, position, age, _) = some_filters(1, rng), some_measurements(1, 3, rng)
     state.P[0] = -np.eye(6)
-    new, innovation = ekf.update(state, z, position, age, None, SIGMA, 3)
+    new, innovation = ekf.update(state, Measurements(z, position, age, None, SIGMA, 3))
     np.testing.assert_array_equal(new.x, state.x)
     assert innovation.rejected[0] == 3 and innovation.rows[0] == 0
 
@@ -220,7 +222,9 @@ def test_the_covariance_stays_symmetric_and_positive():
     place = np.zeros((1, 1, 3))
     for _ in range(1000):
         z = range_azimuth_elevation(START[:3]) + 1e-6 * rng.normal(size=(1, 1, 3))
-        state, _ = ekf.update(ekf.predict(state, DT, 0.0), z, place, None, None, np.full(3, 1e-6), 3)
+        state, _ = ekf.update(
+            ekf.predict(state, DT, 0.0), Measurements(z, place, None, None, np.full(3, 1e-6), 3)
+        )
         state.x[0, 3:] = 0.0
     np.testing.assert_array_equal(state.P, state.P.transpose(0, 2, 1))
     assert np.linalg.eigvalsh(state.P[0])[0] > 0.0
@@ -229,10 +233,11 @@ def test_the_covariance_stays_symmetric_and_positive():
 def test_filters_are_independent_rows():
     rng = np.random.default_rng(15)
     state, arguments = some_filters(6, rng), some_measurements(6, 3, rng)
-    all_rows, _ = ekf.update(state, *arguments, SIGMA, 3)
+    all_rows, _ = ekf.update(state, Measurements(*arguments, SIGMA, 3))
     order = np.array([3, 1, 5])
     some, _ = ekf.update(
-        ekf.TargetFilter(state.x[order], state.P[order]), *(part[order] for part in arguments), SIGMA, 3
+        ekf.TargetFilter(state.x[order], state.P[order]),
+        Measurements(*(part[order] for part in arguments), SIGMA, 3),
     )
     np.testing.assert_array_equal(some.x, all_rows.x[order])
 
@@ -241,7 +246,7 @@ def test_the_arguments_are_left_alone():
     rng = np.random.default_rng(16)
     state, arguments = some_filters(2, rng), some_measurements(2, 3, rng)
     before = [part.copy() for part in (*state, *arguments)]
-    ekf.update(ekf.shift(ekf.predict(state, DT, 0.1), np.ones((2, 3))), *arguments, SIGMA, 3)
+    ekf.update(ekf.shift(ekf.predict(state, DT, 0.1), np.ones((2, 3))), Measurements(*arguments, SIGMA, 3))
     for part, copy in zip((*state, *arguments), before, strict=True):
         np.testing.assert_array_equal(part, copy)
 
@@ -273,13 +278,19 @@ def test_bad_arguments_are_named():
     rng = np.random.default_rng(18)
     state, (z, position, age, valid) = some_filters(2, rng), some_measurements(2, 3, rng)
     with pytest.raises(ValueError, match=r"position must have shape \(2, 3, 3\), got \(2, 2, 3\)"):
-        ekf.update(state, z, position[:, :2], age, valid, SIGMA, 3)
+        ekf.update(state, Measurements(z, position[:, :2], age, valid, SIGMA, 3))
     with pytest.raises(ValueError, match="rows must be 1"):
-        ekf.update(state, z, position, age, valid, SIGMA, 2)
+        ekf.update(state, Measurements(z, position, age, valid, SIGMA, 2))
     with pytest.raises(ValueError, match="sigma must be three standard deviations > 0"):
-        ekf.update(state, z, position, age, valid, np.zeros(3), 3)
+        ekf.update(state, Measurements(z, position, age, valid, np.zeros(3), 3))
     with pytest.raises(ValueError, match="dt must be a finite number >= 0 s, got -1"):
         ekf.predict(state, -1.0, 0.1)
     state.x[1, 2] = np.nan
     with pytest.raises(ValueError, match=r"x must be finite, got nan at \(1, 2\)"):
         ekf.predict(state, DT, 0.1)
+
+
+def test_the_parts_of_the_measurements_one_by_one_are_refused_with_the_form_of_today():
+    rng = np.random.default_rng(0)
+    with pytest.raises(TypeError, match=r"update takes \(state, Measurements\(z, position, age, valid"):
+        ekf.update(some_filters(2, rng), *some_measurements(2, 3, rng), SIGMA, 3)

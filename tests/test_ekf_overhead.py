@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from estimation_runs import DT, SIGMA, START, cv_truth, fly, readable_update, rows_of, start_filters, sweep
 
-from controllers.estimation import ekf
+from controllers.estimation import Measurements, ekf
 from controllers.estimation.consistency import anees, nees
 from quad_envs.rotations import wrap_angle
 from quad_envs.sensors import OVERHEAD, range_azimuth_elevation
@@ -30,7 +30,9 @@ def watch(path, seed, runs=40):
     for r in path:
         z = range_azimuth_elevation(r) + SIGMA * rng.normal(size=(runs, 1, 3))
         z[..., 1] = wrap_angle(z[..., 1])
-        state, innovation = ekf.update(ekf.predict(state, DT, 0.2), z, place, None, None, SIGMA, 3)
+        state, innovation = ekf.update(
+            ekf.predict(state, DT, 0.2), Measurements(z, place, None, None, SIGMA, 3)
+        )
         assert (innovation.rows == 3).all()  # nothing is dropped
         errors.append(state.x[:, :3] - r)
         covariances.append(state.P[:, :3, :3])
@@ -84,7 +86,9 @@ def test_a_prediction_mirrored_from_above_to_below_is_led_back(down):
     state = ekf.TargetFilter(x, np.tile(np.diag([9.0] * 3 + [1.0] * 3), (100, 1, 1)))
     for _ in range(100):
         z = range_azimuth_elevation(truth) + SIGMA * rng.normal(size=(100, 1, 3))
-        state, _ = ekf.update(ekf.predict(state, DT, 0.05), z, np.zeros((100, 1, 3)), None, None, SIGMA, 3)
+        state, _ = ekf.update(
+            ekf.predict(state, DT, 0.05), Measurements(z, np.zeros((100, 1, 3)), None, None, SIGMA, 3)
+        )
     assert np.linalg.norm(state.x[:, :3] - truth, axis=1).max() < 0.5
 
 
@@ -102,7 +106,9 @@ def test_the_update_overhead_agrees_with_its_readable_twin():
     z = range_azimuth_elevation(START[:3] - below) + SIGMA * rng.normal(size=(n, m, 3))
     z[..., 2] *= rng.choice([1.0, -1.0], (n, m), p=[0.8, 0.2])
     age = rng.uniform(0.0, 0.5, (n, m))
-    new, innovation = ekf.update(state, z, below, age, None, SIGMA, 3, None)  # whatever the innovation
+    new, innovation = ekf.update(
+        state, Measurements(z, below, age, None, SIGMA, 3), restart=None
+    )  # whatever the innovation
     replaced = 0
     for i in range(n):
         nu, H, variance = rows_of(state.x[i], z[i], below[i], age[i], 3)
@@ -121,6 +127,6 @@ def test_the_rows_change_at_the_edge_of_overhead_without_a_jump_of_the_estimate(
         d = 4.0 * np.array([ratio, 0.0, -np.sqrt(1.0 - ratio**2)])
         state = ekf.initial_filter(d[None], np.zeros(3), (0.05, 0.1))
         z = range_azimuth_elevation(d)[None, None] + SIGMA
-        new, _ = ekf.update(state, z, np.zeros((1, 1, 3)), None, None, SIGMA, 3)
+        new, _ = ekf.update(state, Measurements(z, np.zeros((1, 1, 3)), None, None, SIGMA, 3))
         states.append(new.x[0] - state.x[0])
     np.testing.assert_allclose(*states, atol=2e-3)  # a twenty-fifth of a standard deviation of the prediction

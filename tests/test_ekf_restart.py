@@ -5,7 +5,7 @@ import pytest
 from estimation_runs import DT, RAILS, SIGMA, START, cv_truth, fly, readable_restart, start_filters
 
 from baselines import EstimateWrapper, make_policy
-from controllers.estimation import ekf
+from controllers.estimation import Measurements, ekf
 from controllers.estimation.ekf_kernels import ALONE_LIMIT
 from controllers.estimation.trilateration import Reason, trilaterate
 from quad_envs import cooperative_estimation_v0, target_tracking_v0
@@ -37,7 +37,7 @@ def errors(state):
 def test_one_measurement_of_range_and_angles_brings_a_lost_filter_back(m, sigmas):
     rng = np.random.default_rng(0)
     z, place = readings(200, m, rng)
-    new, said = ekf.update(wrong_filter(200, sigmas, rng), z, place, None, None, SIGMA, 3)
+    new, said = ekf.update(wrong_filter(200, sigmas, rng), Measurements(z, place, None, None, SIGMA, 3))
     assert said.restarted.all() and (said.nis > ALONE_LIMIT * said.rows).all()
     # From the origin the target is 7.3 m away: 0.1 m and 0.15 m of noise; 1 m is five of its deviations.
     assert errors(new).max() < 1.0
@@ -52,7 +52,9 @@ def test_the_restart_agrees_with_its_readable_twin():
         m = int(rng.integers(1, 5))
         z, place = readings(1, m, rng)
         age = rng.uniform(0.0, 0.3, (1, m))
-        new, said = ekf.update(wrong_filter(1, 60.0, rng), z, place, age, None, SIGMA, 3, RESTART)
+        new, said = ekf.update(
+            wrong_filter(1, 60.0, rng), Measurements(z, place, age, None, SIGMA, 3), restart=RESTART
+        )
         x, P = readable_restart(z[0], place[0], age[0], RESTART)
         assert said.restarted[0]
         np.testing.assert_allclose(new.x[0], x, atol=1e-9)
@@ -63,8 +65,8 @@ def test_a_filter_that_is_right_never_restarts():
     truth = cv_truth(20, np.random.default_rng(2))
     state = start_filters(truth.target[0], 0.25 * np.eye(6), np.random.default_rng(3))
 
-    def never(*arguments):
-        return ekf.update(*arguments, None)
+    def never(state, measured):
+        return ekf.update(state, measured, restart=None)
 
     def predict(state):
         return ekf.predict(state, DT, 0.02)
@@ -92,8 +94,8 @@ def test_a_false_measurement_among_good_ones_is_left_out():
     false[:, 2, 0] += 6.0
     good = np.tile([True, True, False, True], (50, 1))
     state = wrong_filter(50, 0.5, rng)
-    new, said = ekf.update(state, false, place, None, None, SIGMA, 3)
-    expected, _ = ekf.update(state, z, place, None, good, SIGMA, 3)
+    new, said = ekf.update(state, Measurements(false, place, None, None, SIGMA, 3))
+    expected, _ = ekf.update(state, Measurements(z, place, None, good, SIGMA, 3))
     np.testing.assert_array_equal(new.x, expected.x)
     assert (said.rejected == 1).all() and not said.restarted.any()
 
@@ -102,7 +104,7 @@ def test_a_lost_filter_does_not_restart_at_the_false_one_of_three():
     rng = np.random.default_rng(7)
     z, place = readings(50, 3, rng)
     z[:, 0, 1] += 1.0
-    new, said = ekf.update(wrong_filter(50, 40.0, rng), z, place, None, None, SIGMA, 3)
+    new, said = ekf.update(wrong_filter(50, 40.0, rng), Measurements(z, place, None, None, SIGMA, 3))
     assert said.restarted.all() and errors(new).max() < 1.0
 
 
@@ -110,8 +112,8 @@ def test_a_vehicle_alone_is_misled_by_a_false_measurement_for_one_step():
     rng = np.random.default_rng(8)
     z, place = readings(50, 1, rng)
     false = z + np.array([12.0, 0.0, 0.0])
-    misled, _ = ekf.update(wrong_filter(50, 0.5, rng), false, place, None, None, SIGMA, 3)
-    back, said = ekf.update(ekf.predict(misled, DT, 0.02), z, place, None, None, SIGMA, 3)
+    misled, _ = ekf.update(wrong_filter(50, 0.5, rng), Measurements(false, place, None, None, SIGMA, 3))
+    back, said = ekf.update(ekf.predict(misled, DT, 0.02), Measurements(z, place, None, None, SIGMA, 3))
     assert errors(misled).min() > 10.0 and said.restarted.all() and errors(back).max() < 1.0
 
 
@@ -123,8 +125,8 @@ def test_a_range_that_is_not_positive_is_refused(rows, reading):
     broken = z.copy()
     broken[:, 1, 0] = reading
     state = wrong_filter(3, 0.5, rng)
-    new, said = ekf.update(state, broken, place, None, None, SIGMA, rows)
-    expected, _ = ekf.update(state, z, place, None, np.tile([True, False], (3, 1)), SIGMA, rows)
+    new, said = ekf.update(state, Measurements(broken, place, None, None, SIGMA, rows))
+    expected, _ = ekf.update(state, Measurements(z, place, None, np.tile([True, False], (3, 1)), SIGMA, rows))
     np.testing.assert_array_equal(new.x, expected.x)
     assert (said.rejected == 1).all()
 
@@ -139,7 +141,7 @@ def test_ranges_bring_a_lost_filter_to_where_they_allow():
     rng = np.random.default_rng(10)
     for m in (1, 2, 3, 4):
         z, place = readings(50, m, rng)
-        new, said = ekf.update(wrong_filter(50, 40.0, rng), z, place, None, None, SIGMA, 1)
+        new, said = ekf.update(wrong_filter(50, 40.0, rng), Measurements(z, place, None, None, SIGMA, 1))
         assert said.restarted.all()
         fits = np.linalg.norm(new.x[:, None, :3] - place, axis=-1) - z[..., 0]
         assert np.abs(fits).max() < 0.6  # ranges of 0.1 m, of which four cannot all be met
@@ -152,7 +154,11 @@ def test_a_restart_says_which_deviation_is_wrong():
     z, place = readings(1, 1, np.random.default_rng(11))
     state = ekf.initial_filter(START[None, :3], START[3:], (0.5, 0.5))
     with pytest.raises(ValueError, match="six standard deviations > 0"):
-        ekf.update(state, z, place, None, None, SIGMA, 3, ekf.Restart(sigma=(1.0, 1.0, 0.0, 1.0, 1.0, 1.0)))
+        ekf.update(
+            state,
+            Measurements(z, place, None, None, SIGMA, 3),
+            restart=ekf.Restart(sigma=(1.0, 1.0, 0.0, 1, 1, 1)),
+        )
 
 
 # ------------------------------------------------------------------------------- policies and the wrapper

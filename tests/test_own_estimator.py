@@ -32,9 +32,7 @@ class Cartesian:
         return self.pack(ekf.shift(ekf.predict(self.state(memory), dt, self.q), displacement))
 
     def update(self, memory, given):
-        new, _ = ekf.update(
-            self.state(memory), given.z, given.position, given.age, given.valid, given.sigma, given.rows
-        )
+        new, _ = ekf.update(self.state(memory), given)
         return self.pack(new)
 
     def mean(self, memory):

@@ -8,7 +8,7 @@ from policy_flights import fly
 
 from baselines import make_policy
 from baselines.policies.registry import TEAM_POLICIES, serving
-from controllers.estimation import ekf
+from controllers.estimation import Measurements, ekf
 from quad_envs import cooperative_estimation_v0, formation_v0, target_tracking_v0
 from quad_envs.sensors import sensor_rows
 
@@ -39,7 +39,10 @@ def twin_filter(env, flight, agent, q):
         z = np.stack([measured[:, 1], np.arctan2(measured[:, 2], measured[:, 3]), measured[:, 4]], axis=1)
         rows_used = sensor_rows(task.sensor)
         belief, _ = ekf.update(
-            belief, z[None], places[None], ages[None], measured[None, :, 0] > 0, task.sensor_sigma, rows_used
+            belief,
+            Measurements(
+                z[None], places[None], ages[None], measured[None, :, 0] > 0, task.sensor_sigma, rows_used
+            ),
         )
         states.append(belief)
     return states

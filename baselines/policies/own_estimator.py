@@ -82,8 +82,8 @@ class OwnEstimator:
         )  # fmt: skip
         own = self._moved_on(filters, parts.slot, way)
         predicted = self._believed(own)
-        _, said = ekf.update(predicted, z, place, age, valid, self._sigma, self._rows, None)
         given = Measurements(z, place, age, valid, self._sigma, self._rows)
+        _, said = ekf.update(predicted, given, restart=None)
         own = self._memory("update", self.estimator.update(own, given), n)
         x, covariance = self._believed(own)
         filters[:, STAGE] = 1.0

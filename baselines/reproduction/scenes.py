@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.estimation import ekf
+from controllers.estimation import Measurements, ekf
 from controllers.estimation.consistency import anees
 from quad_envs import cooperative_estimation_v0
 from quad_envs.observations.team import COMM_POSITION, COMM_WEIGHT
@@ -132,10 +132,9 @@ Update = Callable[[Filter, Held], tuple[Filter, Array, NDArray[np.int64]]]
 
 def ekf_update(state: Filter, held: Held) -> tuple[Filter, Array, NDArray[np.int64]]:
     """The update of this suite as the text has it: to the first order, and whatever was measured."""
-    believed = ekf.TargetFilter(*state)
-    new, said = ekf.update(
-        believed, held.z, held.places, None, held.valid, held.sigma, held.rows, None, second_order=False
-    )
+    believed, now = ekf.TargetFilter(*state), np.zeros(held.z.shape[:2])
+    measured = Measurements(held.z, held.places, now, held.valid, held.sigma, held.rows)
+    new, said = ekf.update(believed, measured, restart=None, second_order=False)
     return (new.x, new.P), said.nis, said.rows
 
 

@@ -37,7 +37,7 @@ The mean one, ANEES/3, of the scenario of chapter 6 on its seeds 0 to 7: 0.98 to
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,6 +49,7 @@ from quad_envs.sensors import N_MEASUREMENT, SENSORS, sensor_rows
 
 from .arguments import BoolArray, IntArray, as_floats, as_mask, require_non_negative
 from .ekf_kernels import N_TARGET, ekf_scratch, ekf_update_kernel, predict_kernel
+from .protocol import Measurements
 
 TARGET_POSITION = slice(0, 3)
 TARGET_VELOCITY = slice(3, 6)
@@ -187,12 +188,8 @@ def shift(state: TargetFilter, displacement: ArrayLike) -> TargetFilter:
 
 def update(
     state: TargetFilter,
-    z: ArrayLike,
-    position: ArrayLike,
-    age: ArrayLike | None,
-    valid: ArrayLike | None,
-    sigma: ArrayLike,
-    rows: int,
+    measurements: Measurements,
+    *former: Any,
     restart: Restart | None = RESTART,
     second_order: bool = True,
 ) -> tuple[TargetFilter, Innovation]:
@@ -210,12 +207,9 @@ def update(
 
     Args:
         state: n predicted filters.
-        z: Range, azimuth, elevation, (n, m, 3), m, rad, rad; only those of `rows` are read.
-        position: Where each was made, (n, m, 3), m, in the frame of the state.
-        age: How long ago each was made, (n, m), s; None: now.
-        valid: Which are there, (n, m), bool; None: all. A vehicle without any keeps its prediction.
-        sigma: Standard deviations of z, (3,).
-        rows: Which those are, see `quad_envs.sensors.sensor_rows`: 1 is the range, 3 are all.
+        measurements: What the vehicles hold, in the frame of the state; a vehicle without any keeps its
+            prediction.
+        former: Nothing: the parts of the measurements were arguments of their own before.
         restart: What a lost filter begins anew with; None: it never does, and takes every measurement.
         second_order: Whether ranges without angles count to the second order; the dissertation's do not.
 
@@ -224,28 +218,47 @@ def update(
         makes S indefinite, or that alone contradicts all others is left out and counted as rejected.
 
     Raises:
+        TypeError: If the parts of the measurements are given one by one.
         ValueError: If a shape is wrong, a state is not finite, sigma is not positive, or there is no sensor
             of such rows.
     """
+    if former:
+        raise TypeError(f"update takes (state, Measurements({', '.join(Measurements._fields)}), restart=...)")
     new = _copied(state)
     n = len(new.x)
-    measured = as_floats("z", z, (n, None, N_MEASUREMENT), finite=False)
-    m = measured.shape[1]
-    places = as_floats("position", position, (n, m, 3), finite=False)
-    ages = np.zeros((n, m)) if age is None else as_floats("age", age, (n, m), finite=False)
-    noise = as_floats("sigma", sigma, (N_MEASUREMENT,))
-    if not (noise > 0.0).all():
-        raise ValueError(f"sigma must be three standard deviations > 0 (m, rad, rad), got {noise}")
+    z, position, age, valid, sigma, rows = _checked(measurements, n)
+    m = z.shape[1]
+    nis, counts = np.empty(n), np.empty((2, n), dtype=np.int64)
+    restarted = np.empty(n, dtype=np.bool_)
+    anew = np.empty(0) if restart is None else restart.data()
+    scratch = np.empty(ekf_scratch(m, rows))
+    _update_rows(
+        new.x, new.P, z, position, age, valid, sigma, rows, anew, bool(second_order), nis, counts, restarted,
+        scratch,
+    )  # fmt: skip
+    return new, Innovation(nis, counts[0], counts[1], restarted)
+
+
+def _checked(measurements: Measurements, n: int) -> Measurements:
+    """The measurements of n vehicles as arrays of the right shapes.
+
+    Raises:
+        ValueError: See `update`.
+    """
+    z = as_floats("z", measurements.z, (n, None, N_MEASUREMENT), finite=False)
+    m, age, rows = z.shape[1], measurements.age, measurements.rows
+    sigma = as_floats("sigma", measurements.sigma, (N_MEASUREMENT,))
+    if not (sigma > 0.0).all():
+        raise ValueError(f"sigma must be three standard deviations > 0 (m, rad, rad), got {sigma}")
     known = {sensor_rows(name): name for name in SENSORS}
     if rows not in known:
         allowed = " or ".join(f"{number} ({name})" for number, name in known.items())
         raise ValueError(f"rows must be {allowed}, got {shown(rows)}")
-    nis, counts = np.empty(n), np.empty((2, n), dtype=np.int64)
-    mask, restarted = as_mask("valid", valid, (n, m)), np.empty(n, dtype=np.bool_)
-    anew = np.empty(0) if restart is None else restart.data()
-    scratch = np.empty(ekf_scratch(m, rows))
-    _update_rows(
-        new.x, new.P, measured, places, ages, mask, noise, rows, anew, bool(second_order), nis, counts,
-        restarted, scratch,
-    )  # fmt: skip
-    return new, Innovation(nis, counts[0], counts[1], restarted)
+    return Measurements(
+        z,
+        as_floats("position", measurements.position, (n, m, 3), finite=False),
+        np.zeros((n, m)) if age is None else as_floats("age", age, (n, m), finite=False),
+        as_mask("valid", measurements.valid, (n, m)),
+        sigma,
+        rows,
+    )

@@ -22,8 +22,8 @@ class Measurements(NamedTuple):
 
     z: Array  # (n, m, 3), range, azimuth, elevation, m, rad, rad; those of `rows` count
     position: Array  # (n, m, 3), where each was made, relative to the vehicle's present position, m
-    age: Array  # (n, m), how long ago, s
-    valid: BoolArray  # (n, m)
+    age: Array  # (n, m), how long ago, s; `ekf.update` takes None for now, too
+    valid: BoolArray  # (n, m); `ekf.update` takes None for all, too
     sigma: Array  # (3,), standard deviations of z
     rows: int  # which entries of z, `quad_envs.sensors.sensor_rows`: 1 is the range, 3 are all
 

@@ -81,7 +81,7 @@ class PolarEstimator:
     def update(self, memory: Array, measurements: Measurements) -> Array:
         """See `Estimator`. A measurement made `age` ago at p counts as one made now at p + age v."""
         state, kept = _unpacked(memory), memory[:, _STATE:].copy()
-        z, position, age, valid, sigma, rows = measurements
+        z, position, age, valid, _, rows = measurements
         v = polar_ekf.velocity(state.x)
         place = position + age[..., None] * v[:, None]
         if rows == N_MEASUREMENT and len(kept):
@@ -92,7 +92,9 @@ class PolarEstimator:
         if len(kept):
             rest, spread = kept[0, 1:4].tolist(), kept[0, 4:].tolist()
             restart = Restart((rest[0], rest[1], rest[2]), tuple(spread))
-        new, _ = ekf.update(state, z, place, np.zeros_like(age), valid, sigma, rows, restart)
+        new, _ = ekf.update(
+            state, measurements._replace(position=place, age=np.zeros_like(age)), restart=restart
+        )
         return np.concatenate([_packed(new), kept], axis=1)
 
     def mean(self, memory: Array) -> Array:
@@ -151,8 +153,8 @@ class RandomWalkEstimator:
     def update(self, memory: Array, measurements: Measurements) -> Array:
         """See `Estimator`."""
         state = _unpacked(memory)
-        z, position, age, valid, sigma, rows = measurements
-        new, _ = ekf.update(state, z, position, np.zeros_like(age), valid, sigma, rows, None)
+        now = measurements._replace(age=np.zeros_like(measurements.age))
+        new, _ = ekf.update(state, now, restart=None)
         new.x[:, 3:] = state.x[:, 3:]
         new.P[:, 3:], new.P[:, :, 3:] = state.P[:, 3:], state.P[:, :, 3:]
         return _packed(new)
