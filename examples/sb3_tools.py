@@ -1,9 +1,8 @@
-"""Stable-Baselines3's own tools on an unmodified id: a short PPO, and an MPC in `evaluate_policy`.
+"""Stable-Baselines3's own tools on an unmodified id: PPO at its defaults, and an MPC in `evaluate_policy`.
 
-    python -m examples.sb3_tools [--env quad/HelixTracking-v0] [--steps 20000]
+    python -m examples.sb3_tools [--env quad/HelixTracking-v0] [--steps 100000]
 
-So few steps teach nothing yet; this shows the tools. `quad-envs train` has a batched VecEnv and
-settings that learn.
+PPO learns under `FilterAndRescale`; `sb3(model)` flies what it learned in the id as it is, beside the MPC.
 """
 
 import argparse
@@ -16,7 +15,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 import quad_envs  # noqa: F401  registers the ids
-from baselines import make_policy
+from baselines import make_policy, sb3
+from quad_envs.wrappers import FilterAndRescale
 
 
 def report(name, policy, envs, steps):
@@ -29,19 +29,20 @@ def report(name, policy, envs, steps):
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--env", default="quad/HelixTracking-v0")
-    parser.add_argument("--steps", type=int, default=20_000)
+    parser.add_argument("--steps", type=int, default=100_000)
     options = parser.parse_args()
     torch.set_num_threads(1)
 
     env = gym.make(options.env)
     check_env(env)
+    check_env(FilterAndRescale(env))
     steps = env.unwrapped.task.episode_steps
-    envs = make_vec_env(options.env, n_envs=10, seed=0)
+    envs = make_vec_env(options.env, n_envs=10)
+    learning = make_vec_env(options.env, seed=0, wrapper_class=FilterAndRescale)
 
-    model = PPO("MlpPolicy", envs, n_steps=200, batch_size=500, gae_lambda=0.98, seed=0, device="cpu")
-    report("ppo before training", model, envs, steps)
-    model.learn(options.steps)
-    report(f"ppo after {options.steps} steps", model, envs, steps)
+    model = PPO("MlpPolicy", learning, seed=0, device="cpu").learn(options.steps)
+    report(f"ppo after {options.steps} steps", model, learning, steps)
+    report("the same, from the id's own observations", sb3(model), envs, steps)
     report("lmpc", make_policy("lmpc", env), envs, steps)
 
 
