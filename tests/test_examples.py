@@ -2,10 +2,14 @@
 
 import subprocess
 import sys
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
+
+from quad_envs.registration import TRACKING
 
 ROOT = Path(__file__).parent.parent
 # What each needs beyond the suite, its arguments, and what it prints at its end.
@@ -55,3 +59,16 @@ def test_every_example_is_tested_and_says_its_command():
     assert files.keys() == EXAMPLES.keys()
     for name, text in files.items():
         assert f"examples.{name}" in text.split('"""')[1]
+
+
+def test_the_file_for_rl_zoo_has_every_tracking_id_and_names_what_there_is():
+    yaml = pytest.importorskip("yaml", reason="rl-zoo reads its files with it")
+    tables = yaml.safe_load((ROOT / "examples" / "rl_zoo" / "ppo.yml").read_text(encoding="utf-8"))
+    assert tables.keys() - {"default"} == TRACKING.keys()
+    for env_id, table in tables.items():
+        module, _, name = table["env_wrapper"].rpartition(".")
+        wrapper = getattr(import_module(module), name)
+        assert table["policy"] == "MlpPolicy" and table["n_timesteps"] >= 100_000
+        assert table.keys() <= {"env_wrapper", "policy", "n_timesteps"}  # the rest is the learner's default
+        if env_id in TRACKING:
+            assert wrapper(gym.make(env_id)).observation_space.shape[0] < 80

@@ -27,7 +27,7 @@ from .algorithm_options import PpoLagrangianOptions, PpoOptions, SacOptions
 from .features import training_features
 from .held_out import Progress
 from .lagrangian import LagrangianBuffer, LagrangianEnv, Multiplier, Probe
-from .learner import RowBuffer, Tanh
+from .learner import RowBuffer, RowPPO, Tanh
 from .vec_env import TaskOptions, TrainingVecEnv
 
 _PROBES = 500_000_009  # from the seed of training to that of the flights which measure violations
@@ -143,7 +143,7 @@ def make_ppo(
     samples = env.num_envs * options.n_steps
     arguments = _arguments(PPO, options, spent)
     arguments["batch_size"] = math.ceil(samples / max(1, round(samples / options.batch_size)))
-    model = PPO(
+    model = RowPPO(
         "MlpPolicy",
         env,
         **arguments,
