@@ -16,7 +16,7 @@ from controllers.qp.ocp import (
     output_rows,
     rate_weight,
 )
-from controllers.qp.riccati import RICCATI_SCRATCH, optimal_plan, riccati_pass
+from controllers.qp.recursion import Feedback
 from controllers.qp.structured import inverse_factor, make_workspace, solve_structured
 
 SOLVER = StructuredSolver()
@@ -121,7 +121,8 @@ def test_the_inverse_factor_whitens_the_hessian(model, N):
     ws = make_workspace(N, 0, len(qp.A))
     solve_structured(*qp[:-2], *qp.rows, rate_weight(qp), 1, False, ws)
     J_T = np.empty((4 * N, 4 * N))
-    inverse_factor(ws.K, ws.D, ws.A_cl, qp.B, qp.stationary, J_T, ws.wide)
+    feedback = Feedback(ws.transposed, ws.K, ws.D, ws.P_c)
+    inverse_factor(qp.A, qp.B, qp.stationary, feedback, ws.K, J_T, ws.wide, ws.scratch)
     H = condense(qp).H
     np.testing.assert_allclose(J_T @ H @ J_T.T, np.eye(4 * N), atol=1e-9)  # stored by columns: J_T is J'
 
@@ -269,31 +270,3 @@ def test_a_pickled_solver_solves_alike():
     copy = pickle.loads(pickle.dumps(solver))
     assert copy.iteration_limit == 77
     np.testing.assert_array_equal(copy.solve(qp).u, expected.u)
-
-
-def test_the_plan_equals_the_readable_recursion():
-    qp = random_qp(np.random.default_rng(12), 6, "ltv", "none")._replace(**FREE)
-    N = 6
-    P, s = qp.Q_f, -qp.Q_f @ qp.r[N]
-    gains = []
-    for i in range(N - 1, -1, -1):
-        A, B = qp.A[i], qp.B[i]
-        y = s + P @ qp.c[i]
-        S = qp.R + B.T @ P @ B
-        K, k = np.linalg.solve(S, B.T @ P @ A), np.linalg.solve(S, B.T @ y)
-        gains.append((K, k))
-        A_cl = A - B @ K
-        s, P = A_cl.T @ y - qp.Q[i] @ qp.r[i], qp.Q[i] + A.T @ P @ A_cl
-    x = qp.x_0
-    ws = make_workspace(N, 0, N)
-    scratch = np.empty((RICCATI_SCRATCH, 12, 12))
-    riccati_pass(
-        qp.A, qp.B, qp.c, qp.Q, qp.R, qp.Q_f, False, ws.transposed, ws.K, ws.D, ws.A_cl, ws.P_c, scratch
-    )
-    matrices = (ws.transposed, ws.K, ws.D, ws.A_cl, ws.P_c)
-    optimal_plan(qp.B, qp.c, qp.Q, qp.Q_f, qp.x_0, qp.r, False, *matrices, ws.u, ws.x, scratch)
-    for i, (K, k) in enumerate(gains[::-1]):
-        u = -K @ x - k
-        np.testing.assert_allclose(ws.u[i], u, atol=1e-10)
-        x = qp.A[i] @ x + qp.B[i] @ u + qp.c[i]
-    np.testing.assert_allclose(ws.x[N], x, atol=1e-10)

@@ -21,7 +21,8 @@ from ..mpc.kernels import copy_vector
 from ..mpc.options import chosen
 from ..qp.linalg import copy
 from ..qp.ocp import IntArray, OcpQp, no_rows
-from ..qp.riccati import DARE_SCRATCH, dare, lqr_gain, solve_dare, stage_gains
+from ..qp.recursion import stage_gains
+from ..qp.riccati import DARE_SCRATCH, dare, lqr_gain, solve_dare
 from .options import LqrOptions, SdreOptions, StateFeedbackOptions
 
 _MATRICES = DARE_SCRATCH + 6
@@ -44,14 +45,14 @@ def sdre_gain(
         K: Result, (4, 12).
         scratch: Overwritten, (_MATRICES, 12, 12).
     """
-    A_c, A, P, A_cl = scratch[0], scratch[1], scratch[2], scratch[3]
+    A_c, A, P = scratch[0], scratch[1], scratch[2]
     B = scratch[4].reshape(-1)[: N_STATE * N_INPUT].reshape(N_STATE, N_INPUT)
     D = scratch[5].reshape(-1)[: N_INPUT * N_INPUT].reshape(N_INPUT, N_INPUT)
     sdc_matrix(x, alpha, c, A_c)
     zero_order_hold(A_c, B_c, dt, A, B, scratch[6:])
     if solve_dare(A, B, Q, R, P, scratch[6:]) < 0:
         return False
-    stage_gains(P, A, B, R, K, D, A_cl, scratch[6:])
+    stage_gains(P, A, B, R, K, D, scratch[6:])
     return True
 
 

@@ -20,9 +20,9 @@ from ..fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXE
 from ..frame import add_rotor_lag, level_velocity, set_references, set_state, turn_rows
 from ..qp.active_set import INACCURATE, INFEASIBLE, OPTIMAL
 from ..qp.linalg import copy, take, take_blocks
-from ..qp.ocp import IntArray
+from ..qp.ocp import IntArray, OcpQp, StateRows
 from ..qp.riccati import DARE_SCRATCH
-from ..qp.structured import Workspace, solve_structured
+from ..qp.structured import Workspace, solve_qp
 from ..qp.working_set import pack_working_set, unpack_working_set
 from .present_axes import body_outputs
 
@@ -259,15 +259,16 @@ def solve_row(
     iterations = 0
     rate_step = data.rate_step
     stage, n_rows = data.stage[:K], 4 * ws.u.size + 2 * K
+    rows = StateRows(s.normals[:H], data.normal[:K], stage, s.row_lower[:K], s.row_upper[:K], s.weight[:K])
     warm = unpack_working_set(s.working, stage, ws.active, ws.guess[:n_rows])
     for i in range(s.working.shape[0]):
         s.working[i] = 0.0
     while True:
-        status, count = solve_structured(
-            A, B, s.c, Q, data.R, Q_f, stationary, s.x_0, r, s.lower, s.upper, rate_step, s.u_last,
-            s.normals[:H], data.normal[:K], stage, s.row_lower[:K], s.row_upper[:K], s.weight[:K],
-            data.R_rate, data.iteration_limit, warm, ws,
+        qp = OcpQp(
+            A, B, s.c, Q, data.R, Q_f, stationary, s.x_0, r, s.lower, s.upper, rate_step, s.u_last, rows,
+            data.R_rate,
         )  # fmt: skip
+        status, count = solve_qp(qp, data.iteration_limit, warm, ws)
         iterations += count
         close = status == INACCURATE and _is_close(ws.error, data.force_max)
         if status == OPTIMAL or close:

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from quad_envs._numba import kernel
 from quad_envs.parameters import N_INPUT, Array
 
-from .linalg import add_matvec_transposed
 from .ocp import IntArray
-from .riccati import step_plan
+from .products import add_matvec_transposed
+from .recursion import step_plan
 
 ByteArray = NDArray[np.int8]
 

@@ -28,21 +28,6 @@ def matmul(A: Array, B: Array, out: Array) -> None:
 
 
 @kernel
-def matmul_sparse(A: Array, B: Array, out: Array) -> None:
-    """The product A B into out, skipping the zero entries of A: worth it from about two thirds of zeros."""
-    n, inner = A.shape
-    m = B.shape[1]
-    for i in range(n):
-        for j in range(m):
-            out[i, j] = 0.0
-        for k in range(inner):
-            factor = A[i, k]
-            if factor != 0.0:
-                for j in range(m):
-                    out[i, j] += factor * B[k, j]
-
-
-@kernel
 def matvec(A: Array, x: Array, out: Array) -> None:
     """The product A x of A (n, k) and x (k,) into out (n,)."""
     for i in range(A.shape[0]):
@@ -50,20 +35,6 @@ def matvec(A: Array, x: Array, out: Array) -> None:
         for j in range(A.shape[1]):
             total += A[i, j] * x[j]
         out[i] = total
-
-
-@kernel
-def add_matvec_transposed(A: Array, x: Array, sign: float, out: Array) -> None:
-    """Adds sign A' x to out (n,), for A (k, n) and x (k,), skipping the zero entries of x.
-
-    Where A is symmetric or its transpose is at hand this is the fast way to a product with A: a sum of
-    rows is vectorised, a sum along a row is not (its order would change).
-    """
-    for i in range(A.shape[0]):
-        factor = sign * x[i]
-        if factor != 0.0:
-            for j in range(A.shape[1]):
-                out[j] += factor * A[i, j]
 
 
 @kernel

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_envs._numba import kernel
 from quad_envs.names import shown
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 
@@ -141,6 +142,12 @@ def first_move_bounds(qp: OcpQp) -> tuple[Array, Array]:
 def rate_weight(qp: OcpQp) -> Array:
     """`qp.R_rate` as compiled code takes it: (0, 4) for none."""
     return np.zeros((0, N_INPUT)) if qp.R_rate is None else qp.R_rate
+
+
+@kernel
+def weight_of_changes(qp: OcpQp) -> Array:
+    """R_rate of a problem in compiled code, where it is an array: (0, 4) where changes have no weight."""
+    return qp.R_rate  # type: ignore[return-value]
 
 
 def condense(qp: OcpQp) -> Condensed:

@@ -1,6 +1,6 @@
 """A weight S = `OcpQp.R_rate` on changes of the input: |u_i - u_{i-1}|_S^2 at i < N, with u_{-1} = u_last.
 
-The recursion of `riccati.py` runs over z = [x; u_prev]. Its input v = u - T u_prev with T = (R + S)^-1 S
+The recursion of `recursion.py` runs over z = [x; u_prev]. Its input v = u - T u_prev with T = (R + S)^-1 S
 leaves no product of input and state in the cost of a stage,
 
     |u|_R^2 + |u - u_prev|_S^2 = |v|_{R+S}^2 + |u_prev|_{R T}^2,
@@ -18,7 +18,8 @@ from quad_envs._numba import kernel
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 
 from .linalg import copy, fill, lu_solve, matmul, take_blocks
-from .riccati import RICCATI_SCRATCH, optimal_plan, riccati_pass
+from .ocp import OcpQp, weight_of_changes
+from .recursion import RECURSION_SCRATCH, Feedback, Regulator, optimal_plan, riccati_pass
 
 _SIZE = N_STATE + N_INPUT
 
@@ -26,44 +27,34 @@ _SIZE = N_STATE + N_INPUT
 class RateWorkspace(NamedTuple):
     """The problem over z = [x; u_prev] and its recursion; see `carve_rate`."""
 
-    A: Array  # (1 or N, 16, 16)
-    B: Array  # (1 or N, 16, 4)
-    c: Array  # (N, 16)
-    Q: Array  # (N, 16, 16)
-    Q_f: Array  # (16, 16)
-    R: Array  # (4, 4), R + S
+    problem: Regulator  # of v, n = 16, R + S in the place of R; `stationary` is False
+    feedback: Feedback  # of v; its D is that of u, too
+    K_u: Array  # (N, 4, 16), gains of u
     T: Array  # (4, 4)
-    x_0: Array  # (16,)
-    r: Array  # (N+1, 16)
-    transposed: Array  # (1 or N, 20, 16)
-    K: Array  # (N, 4, 16), gains of v
-    K_u: Array  # (N, 4, 16), of u
-    A_cl: Array  # (N, 16, 16)
-    P_c: Array  # (N, 16)
     v: Array  # (N, 4)
     z: Array  # (N+1, 16)
     wide: Array  # (2, 16, 4N)
-    scratch: Array  # (RICCATI_SCRATCH, 16, 16)
+    scratch: Array  # (RECURSION_SCRATCH, 16, 16)
 
 
 def rate_size(horizon: int, n_models: int) -> int:
     """Numbers that `carve_rate` needs."""
     N, M, n, m = horizon, n_models, _SIZE, N_INPUT
-    pairs, stages = M * (2 * n + 2 * m) * n, N * (2 * n * n + 2 * m * n + 2 * n + m) + 2 * n * (N + 1)
-    return pairs + stages + n * n + 2 * m * m + n + 2 * n * m * N + RICCATI_SCRATCH * n * n
+    pairs, stages = M * (2 * n + 2 * m) * n, N * (n * n + 2 * m * n + 2 * n + m) + 2 * n * (N + 1)
+    return pairs + stages + n * n + 2 * m * m + n + 2 * n * m * N + RECURSION_SCRATCH * n * n
 
 
 @kernel
-def carve_rate(buffer: Array, N: int, M: int) -> RateWorkspace:
-    """Views of the buffer: one array is unpacked at a call from Python instead of eighteen."""
-    n, m = _SIZE, N_INPUT
+def carve_rate(buffer: Array, qp: OcpQp, D: Array) -> RateWorkspace:
+    """Views of the buffer: a call from Python unpacks one array. D, (N, 4, 4), is of v and of u."""
+    n, m, N, M, W = _SIZE, N_INPUT, qp.c.shape[0], qp.A.shape[0], qp.Q.shape[0]
     A = take_blocks(buffer, 0, M, n, n)
     i = A.size
     B = take_blocks(buffer, i, M, n, m)
     i += B.size
     transposed = take_blocks(buffer, i, M, n + m, n)
     i += transposed.size
-    square = take_blocks(buffer, i, 2 * N + 1, n, n)
+    square = take_blocks(buffer, i, W + 1, n, n)
     i += square.size
     gains = take_blocks(buffer, i, 2 * N, m, n)
     i += gains.size
@@ -79,11 +70,10 @@ def carve_rate(buffer: Array, N: int, M: int) -> RateWorkspace:
     i += n
     wide = take_blocks(buffer, i, 2, n, m * N)
     i += wide.size
-    scratch = take_blocks(buffer, i, RICCATI_SCRATCH, n, n)
-    return RateWorkspace(
-        A, B, stages[0], square[:N], square[2 * N], small[0], small[1], x_0, points[0], transposed, gains[:N],
-        gains[N:], square[N : 2 * N], stages[1], v, points[1], wide, scratch,
-    )  # fmt: skip
+    scratch = take_blocks(buffer, i, RECURSION_SCRATCH, n, n)
+    problem = Regulator(A, B, stages[0], square[:W], small[0], square[W], False, x_0, points[0])
+    feedback = Feedback(transposed, gains[:N], D, stages[1])
+    return RateWorkspace(problem, feedback, gains[N:], small[1], v, points[1], wide, scratch)
 
 
 @kernel
@@ -122,74 +112,40 @@ def _augment_pair(A: Array, B: Array, T: Array, A_z: Array, B_z: Array) -> None:
 
 
 @kernel
-def rate_pass(
-    A: Array,
-    B: Array,
-    c: Array,
-    Q: Array,
-    R: Array,
-    Q_f: Array,
-    x_0: Array,
-    u_last: Array,
-    r: Array,
-    S: Array,
-    D: Array,
-    w: RateWorkspace,
-) -> None:
-    """The problem over z into w, and its backward pass over matrices; data as of `solve_structured`.
-
-    Args:
-        A: (1 or N, 12, 12).
-        B: (1 or N, 12, 4).
-        c: (N, 12).
-        Q: (1 or N, 12, 12).
-        R: (4, 4).
-        Q_f: (12, 12).
-        x_0: (12,).
-        u_last: (4,).
-        r: (N+1, 12).
-        S: Weight of the changes, (4, 4).
-        D: Result, inverse Cholesky factors, (N, 4, 4), of v and of u.
-        w: Results.
-    """
-    (N, n), m = c.shape, B.shape[2]
+def rate_pass(qp: OcpQp, w: RateWorkspace) -> None:
+    """The problem over z into w, and its backward pass over matrices; R_rate is an array."""
+    (N, n), m, z = qp.c.shape, N_INPUT, w.problem
     RT = w.scratch[0].reshape(-1)[: m * m].reshape(m, m)
-    _weigh_changes(R, S, w.R, w.T, RT)
-    for j in range(A.shape[0]):
-        _augment_pair(A[j], B[j], w.T, w.A[j], w.B[j])
-    for i in range(Q.shape[0]):
-        fill(w.Q[i], 0.0)
-        copy(Q[i], w.Q[i])
+    _weigh_changes(qp.R, weight_of_changes(qp), z.R, w.T, RT)
+    for j in range(qp.A.shape[0]):
+        _augment_pair(qp.A[j], qp.B[j], w.T, z.A[j], z.B[j])
+    for i in range(qp.Q.shape[0]):
+        fill(z.Q[i], 0.0)
+        copy(qp.Q[i], z.Q[i])
         for a in range(m):
             for b in range(m):
-                w.Q[i, n + a, n + b] = 0.5 * (RT[a, b] + RT[b, a])
-    fill(w.Q_f, 0.0)
-    copy(Q_f, w.Q_f)
-    copy(c, w.c)
-    copy(r, w.r)
+                z.Q[i, n + a, n + b] = 0.5 * (RT[a, b] + RT[b, a])
+    fill(z.Q_f, 0.0)
+    copy(qp.Q_f, z.Q_f)
+    copy(qp.c, z.c)
+    copy(qp.r, z.r)
     for a in range(n):
-        w.x_0[a] = x_0[a]
+        z.x_0[a] = qp.x_0[a]
     for a in range(m):
-        w.x_0[n + a] = u_last[a]
-    riccati_pass(
-        w.A[: A.shape[0]], w.B[: A.shape[0]], w.c, w.Q[: Q.shape[0]], w.R, w.Q_f, False,
-        w.transposed[: A.shape[0]], w.K, D, w.A_cl, w.P_c, w.scratch,
-    )  # fmt: skip
+        z.x_0[n + a] = qp.u_last[a]
+    riccati_pass(z, w.feedback, w.scratch)
     for i in range(N):
-        copy(w.K[i], w.K_u[i])
+        copy(w.feedback.K[i], w.K_u[i])
         for a in range(m):
             for b in range(m):
                 w.K_u[i, a, n + b] -= w.T[a, b]
 
 
 @kernel
-def rate_plan(pairs: int, weights: int, D: Array, w: RateWorkspace, u: Array, x: Array) -> None:
-    """The unconstrained optimum after `rate_pass`, with the number of its pairs and stage weights."""
+def rate_plan(w: RateWorkspace, u: Array, x: Array) -> None:
+    """The unconstrained optimum after `rate_pass`."""
     n, m = x.shape[1], u.shape[1]
-    optimal_plan(
-        w.B[:pairs], w.c, w.Q[:weights], w.Q_f, w.x_0, w.r, False, w.transposed[:pairs], w.K, D, w.A_cl,
-        w.P_c, w.v, w.z, w.scratch,
-    )  # fmt: skip
+    optimal_plan(w.problem, w.feedback, w.v, w.z, w.scratch[0])
     for i in range(x.shape[0]):
         for a in range(n):
             x[i, a] = w.z[i, a]

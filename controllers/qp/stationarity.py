@@ -12,7 +12,9 @@ from quad_envs._numba import kernel
 from quad_envs.parameters import Array
 
 from .active_set import RowData
-from .linalg import add_matvec_transposed, fill
+from .linalg import fill
+from .ocp import OcpQp, weight_of_changes
+from .products import add_matvec_transposed
 
 REFINED = 1e-9  # relative stationarity above which a solution is refined once
 STATIONARY = 1e-8  # and above which it is not called optimal: 1e-6 less what another order of summation adds
@@ -70,7 +72,7 @@ def _pull_of_rows(rows: RowData, multipliers: Array, base: int, force: Array) ->
 
 @kernel
 def _roll_out(c: Array, x_0: Array, transposed: Array, u: Array, x: Array) -> None:
-    """x_{i+1} = B_i u_i + A_i x_i + c_i, in this order; `riccati.step_plan` begins with c_i and A_i x_i."""
+    """x_{i+1} = B_i u_i + A_i x_i + c_i, in this order; `recursion.step_plan` begins with c_i and A_i x_i."""
     n = x.shape[1]
     for a in range(n):
         x[0, a] = x_0[a]
@@ -97,16 +99,7 @@ def _pull_of_changes(S: Array, u_last: Array, u: Array, i: int, a: int) -> tuple
 
 @kernel
 def lagrangian_gradient(
-    A: Array,
-    B: Array,
-    c: Array,
-    Q: Array,
-    R: Array,
-    Q_f: Array,
-    x_0: Array,
-    r: Array,
-    R_rate: Array,
-    u_last: Array,
+    qp: OcpQp,
     transposed: Array,
     rows: RowData,
     u: Array,
@@ -119,16 +112,7 @@ def lagrangian_gradient(
     """Gradient in u of cost - sum lambda (a'u - b), by the costate: `g_i = R u_i + B_i' y_{i+1} - pulls`.
 
     Args:
-        A: (1 or N, 12, 12).
-        B: (1 or N, 12, 4).
-        c: (N, 12).
-        Q: (1 or N, 12, 12).
-        R: (4, 4).
-        Q_f: (12, 12).
-        x_0: (12,).
-        r: (N+1, 12).
-        R_rate: (4, 4), or (0, 4) where changes have no weight.
-        u_last: (4,).
+        qp: The problem; R_rate is an array, (0, 4) where changes have no weight.
         transposed: [A_i B_i]', (1 or N, 16, 12).
         rows: The rows of the problem.
         u: (N, 4).
@@ -141,17 +125,18 @@ def lagrangian_gradient(
     Returns:
         Its largest entry over 1 + the largest entry of its terms R u_i, B_i' y_{i+1} and S (u_i - u_{i-1}).
     """
+    A, B, Q, R, r, R_rate = qp.A, qp.B, qp.Q, qp.R, qp.r, weight_of_changes(qp)
     N, m = u.shape
     nv = N * m
-    n, x, difference = x_0.shape[0], states, scratch[2]
-    _roll_out(c, x_0, transposed, u, x)
+    n, x, difference = qp.x_0.shape[0], states, scratch[2]
+    _roll_out(qp.c, qp.x_0, transposed, u, x)
     _pull_of_rows(rows, multipliers, 4 * nv, force)
     for i in range(N, 0, -1):
         y, y_next = scratch[i % 2], scratch[1 - i % 2]
         for a in range(n):
             difference[a] = x[i, a] - r[i, a]
             y[a] = -force[i, a]
-        add_matvec_transposed(Q_f if i == N else Q[i if Q.shape[0] > 1 else 0], difference, 1.0, y)
+        add_matvec_transposed(qp.Q_f if i == N else Q[i if Q.shape[0] > 1 else 0], difference, 1.0, y)
         if i < N:
             add_matvec_transposed(A[i if A.shape[0] > 1 else 0], y_next, 1.0, y)
         block = gradient[m * (i - 1) : m * i]
@@ -167,7 +152,7 @@ def lagrangian_gradient(
                 own += R[a, b] * u[i, b]
             scale = max(scale, 1.0 + abs(own), 1.0 + abs(gradient[k]))
             if R_rate.shape[0] > 0:
-                before, after = _pull_of_changes(R_rate, u_last, u, i, a)
+                before, after = _pull_of_changes(R_rate, qp.u_last, u, i, a)
                 scale = max(scale, 1.0 + abs(before), 1.0 + abs(after))
                 own += before - after
             value = own + gradient[k] - multipliers[k] + multipliers[nv + k]

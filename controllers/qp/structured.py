@@ -36,10 +36,11 @@ from .active_set import (
     row_spans,
     worst_row,
 )
-from .linalg import fill, transpose
-from .ocp import IntArray, OcpQp, rate_weight, validate
+from .linalg import fill
+from .ocp import IntArray, OcpQp, StateRows, rate_weight, validate, weight_of_changes
+from .products import add_product, negate, transpose
 from .rate_weight import carve_rate, rate_pass, rate_plan, rate_size
-from .riccati import RICCATI_SCRATCH, optimal_plan, riccati_pass, step_plan
+from .recursion import RECURSION_SCRATCH, Feedback, Regulator, optimal_plan, riccati_pass, step_plan
 from .solution import Multipliers, Solution, Status
 from .stationarity import REFINED, STATIONARY, is_mild, lagrangian_gradient
 from .working_set import correct, start_from_guess
@@ -58,10 +59,9 @@ class Workspace(NamedTuple):
     transposed: Array  # (1 or N, 16, 12), [A_i B_i]'
     K: Array  # (N, 4, 12), gains
     D: Array  # (N, 4, 4), inverse Cholesky factors
-    A_cl: Array  # (N, 12, 12), closed loops
     P_c: Array  # (N, 12)
     first_move: Array  # (2, 4), bounds on u_0
-    scratch: Array  # (RICCATI_SCRATCH, 12, 12)
+    scratch: Array  # (RECURSION_SCRATCH, 12, 12)
     wide: Array  # (2, 12, 4N)
     factors: Array  # (2, 4N, 4N): J and R, by columns
     vectors: Array  # (N_VECTORS, 4N + 12)
@@ -102,10 +102,9 @@ def make_workspace(horizon: int, n_rows: int, n_models: int, weighs_changes: boo
         transposed=np.zeros((n_models, n + m, n)),
         K=np.zeros((N, m, n)),
         D=np.zeros((N, m, m)),
-        A_cl=np.zeros((N, n, n)),
         P_c=np.zeros((N, n)),
         first_move=np.zeros((2, m)),
-        scratch=np.zeros((RICCATI_SCRATCH, n, n)),
+        scratch=np.zeros((RECURSION_SCRATCH, n, n)),
         wide=np.zeros((2, n, nv)),
         factors=np.zeros((2, nv, nv)),
         vectors=np.zeros((N_VECTORS, nv + n)),
@@ -158,34 +157,53 @@ def _march(K: Array, A_cl: Array, X: Array, width: int, J_T: Array, w: int, X_ne
 
 
 @kernel
+def _close_loop(A: Array, B_T: Array, K: Array, minus: Array, A_cl: Array) -> None:
+    """A_cl = A - B K, with B' as `riccati_pass` leaves it."""
+    negate(K, minus)
+    add_product(A, B_T, minus, A_cl)
+
+
+@kernel
 def inverse_factor(
-    K: Array, D: Array, A_cl: Array, B: Array, stationary: bool, J_T: Array, wide: Array
+    A: Array,
+    B: Array,
+    stationary: bool,
+    feedback: Feedback,
+    K_u: Array,
+    J_T: Array,
+    wide: Array,
+    scratch: Array,
 ) -> None:
     """J with J J' = H^-1: J_jj = D_j, J_ij = -K_i A_cl_{i-1} .. A_cl_{j+1} B_j D_j below, 0 above.
 
     Marches the response X_i of x_i to all whitened inputs before stage i: rows i of J left of the diagonal
-    are -K_i X_i, and X_{i+1} = [A_cl_i X_i, B_i D_i]. With one gain J is block Toeplitz: the first block
-    column is marched and the others are copies.
+    are -K_i X_i, and X_{i+1} = [A_cl_i X_i, B_i D_i] with A_cl = A - B K. With one gain J is block Toeplitz:
+    the first block column is marched and the others are copies.
 
     Args:
-        K: Gains, (N, 4, 12).
-        D: Inverse Cholesky factors, (N, 4, 4).
-        A_cl: Closed loops, (N, 12, 12).
-        B: (1 or N, 12, 4).
+        A: (1 or N, n, n).
+        B: (1 or N, n, 4).
         stationary: Whether the first gain serves all stages.
+        feedback: Of `riccati_pass`.
+        K_u: Gains of u, (N, 4, n): those of the feedback, but where changes of u have a weight.
         J_T: Result, J by columns, (4N, 4N).
-        wide: Overwritten, (2, 12, 4N).
+        wide: Overwritten, (2, n, 4N).
+        scratch: Overwritten, (2, n, n).
     """
+    K, D, A_cl = feedback.K, feedback.D, scratch[0]
     N, m = D.shape[:2]
-    nv = m * N
+    n, nv = A.shape[1], m * N
     fill(J_T, 0.0)
     for i in range(N):
         X, X_next = wide[i % 2], wide[1 - i % 2]
         g = 0 if stationary else i
+        j = i if B.shape[0] > 1 else 0
+        if i == 1 or (i > 1 and not stationary):
+            _close_loop(A[j], feedback.transposed[j, n:], K[g], scratch[1], A_cl)
         if i > 0:
-            _march(K[g], A_cl[g], X, m if stationary else m * i, J_T, m * i, X_next)
+            _march(K_u[g], A_cl, X, m if stationary else m * i, J_T, m * i, X_next)
         if i == 0 or not stationary:
-            _start_column(B[i if B.shape[0] > 1 else 0], D[g], J_T, m * i, X_next, m * i)
+            _start_column(B[j], D[g], J_T, m * i, X_next, m * i)
     if stationary:
         for k in range(m, nv):
             start = k - k % m
@@ -194,30 +212,60 @@ def inverse_factor(
 
 
 @kernel
-def _recursion(
-    A: Array,
-    B: Array,
-    c: Array,
-    Q: Array,
-    R: Array,
-    Q_f: Array,
-    stationary: bool,
-    x_0: Array,
-    r: Array,
-    R_rate: Array,
-    u_last: Array,
-    ws: Workspace,
-) -> None:
+def _feedback(pairs: int, ws: Workspace) -> Feedback:
+    """What the recursion over x finds, in the memory for it."""
+    return Feedback(ws.transposed[:pairs], ws.K, ws.D, ws.P_c)
+
+
+@kernel
+def _regulator(qp: OcpQp) -> Regulator:
+    """The problem without constraints."""
+    return Regulator(qp.A, qp.B, qp.c, qp.Q, qp.R, qp.Q_f, qp.stationary, qp.x_0, qp.r)
+
+
+@kernel
+def _recursion(qp: OcpQp, ws: Workspace) -> None:
     """The backward pass over matrices, of x or, where changes have a weight, of [x; u_prev]."""
-    transposed, n = ws.transposed[: A.shape[0]], A.shape[1]
-    if R_rate.shape[0] == 0:
-        riccati_pass(A, B, c, Q, R, Q_f, stationary, transposed, ws.K, ws.D, ws.A_cl, ws.P_c, ws.scratch)
+    pairs, n = qp.A.shape[0], qp.A.shape[1]
+    if weight_of_changes(qp).shape[0] == 0:
+        riccati_pass(_regulator(qp), _feedback(pairs, ws), ws.scratch)
         return
-    for j in range(A.shape[0]):
-        transpose(A[j], transposed[j, :n])
-        transpose(B[j], transposed[j, n:])
-    rate = carve_rate(ws.rate, c.shape[0], ws.transposed.shape[0])
-    rate_pass(A, B, c, Q, R, Q_f, x_0, u_last, r, R_rate, ws.D, rate)
+    for j in range(pairs):
+        transpose(qp.A[j], ws.transposed[j, :n])
+        transpose(qp.B[j], ws.transposed[j, n:])
+    rate_pass(qp, carve_rate(ws.rate, qp, ws.D))
+
+
+@kernel
+def _plan(qp: OcpQp, ws: Workspace) -> None:
+    """The unconstrained optimum into ws.u and ws.x, after `_recursion`."""
+    if weight_of_changes(qp).shape[0] == 0:
+        optimal_plan(_regulator(qp), _feedback(qp.A.shape[0], ws), ws.u, ws.x, ws.scratch[0])
+    else:
+        rate_plan(carve_rate(ws.rate, qp, ws.D), ws.u, ws.x)
+
+
+@kernel
+def _factor(qp: OcpQp, ws: Workspace) -> None:
+    """J into ws.factors[0], after `_recursion`."""
+    J_T = ws.factors[0]
+    if weight_of_changes(qp).shape[0] == 0:
+        found = _feedback(qp.A.shape[0], ws)
+        inverse_factor(qp.A, qp.B, qp.stationary, found, found.K, J_T, ws.wide, ws.scratch)
+    else:
+        w = carve_rate(ws.rate, qp, ws.D)
+        inverse_factor(w.problem.A, w.problem.B, False, w.feedback, w.K_u, J_T, w.wide, w.scratch)
+
+
+@kernel
+def _stationarity(qp: OcpQp, rows: RowData, ws: Workspace) -> float:
+    """Relative stationarity of ws.u with ws.multipliers; the gradient of the Lagrangian into ws.gradient."""
+    transposed = ws.transposed[: qp.A.shape[0]]
+    return float(
+        lagrangian_gradient(
+            qp, transposed, rows, ws.u, ws.multipliers, ws.states, ws.force, ws.gradient, ws.scratch[1]
+        )
+    )
 
 
 @kernel
@@ -268,38 +316,20 @@ def _largest_gap(rows: RowData, q: int, ws: Workspace) -> float:
 
 
 @kernel
-def _finish(
-    A: Array,
-    B: Array,
-    c: Array,
-    Q: Array,
-    R: Array,
-    Q_f: Array,
-    x_0: Array,
-    r: Array,
-    R_rate: Array,
-    u_last: Array,
-    rows: RowData,
-    q: int,
-    ws: Workspace,
-) -> int:
+def _finish(qp: OcpQp, rows: RowData, q: int, ws: Workspace) -> int:
     """Multipliers, and OPTIMAL or INACCURATE for the face reached: refined once if it is not stationary."""
     u, x = ws.u, ws.x
     sign, nu, cap = ws.vectors[3], ws.vectors[4], ws.vectors[5]
     n_rows = 4 * u.size + 2 * rows.normal.shape[0]
-    transposed = ws.transposed[: A.shape[0]]
     relative, gap = math.inf, math.inf
     for attempt in range(2):
         if attempt == 1:
             correct(rows, ws.gradient, u, x, ws.factors[0], ws.factors[1], ws.active, ws.vectors, q)
             for i in range(u.shape[0]):
-                step_plan(transposed, c, i, u, x)
+                step_plan(ws.transposed[: qp.A.shape[0]], qp.c, i, u, x)
         _clear(ws.multipliers, n_rows)
         collect_multipliers(ws.state, ws.active, sign, nu, cap, rows.weight, q, 4 * u.size, ws.multipliers)
-        relative = lagrangian_gradient(
-            A, B, c, Q, R, Q_f, x_0, r, R_rate, u_last, transposed, rows, u, ws.multipliers, ws.states,
-            ws.force, ws.gradient, ws.scratch[1],
-        )  # fmt: skip
+        relative = _stationarity(qp, rows, ws)
         gap = _largest_gap(rows, q, ws)
         if attempt == 0 and relative <= REFINED and gap <= ROW_TOLERANCE:
             return OPTIMAL
@@ -314,52 +344,120 @@ def _finish(
 
 @kernel
 def _solve_rows(
-    A: Array,
-    B: Array,
-    c: Array,
-    Q: Array,
-    R: Array,
-    Q_f: Array,
-    stationary: bool,
-    x_0: Array,
-    r: Array,
-    R_rate: Array,
-    u_last: Array,
-    rows: RowData,
-    warm: bool,
-    iterations: int,
-    iteration_limit: int,
-    ws: Workspace,
+    qp: OcpQp, rows: RowData, warm: bool, iterations: int, iteration_limit: int, ws: Workspace
 ) -> tuple[int, int]:
     """From the unconstrained optimum in ws to the constrained one; with `warm` by way of ws.guess."""
-    u, x, transposed = ws.u, ws.x, ws.transposed[: A.shape[0]]
+    u, x, transposed = ws.u, ws.x, ws.transposed[: qp.A.shape[0]]
     J_T, R_T = ws.factors[0], ws.factors[1]
-    if R_rate.shape[0] > 0:
-        rate = carve_rate(ws.rate, c.shape[0], ws.transposed.shape[0])
-        inverse_factor(rate.K_u, ws.D, rate.A_cl, rate.B[: B.shape[0]], False, J_T, rate.wide)
-    else:
-        inverse_factor(ws.K, ws.D, ws.A_cl, B, stationary, J_T, ws.wide)
+    n_rows = 4 * u.size + 2 * rows.normal.shape[0]
+    _factor(qp, ws)
     q = 0
     ws.error[0] = math.inf
-    _clear(ws.state, 4 * u.size + 2 * rows.normal.shape[0])
+    _clear(ws.state, n_rows)
     if warm:
-        guess = ws.guess[: 4 * u.size + 2 * rows.normal.shape[0]]
         q, changes = start_from_guess(
-            A, B, c, transposed, rows, guess, u, x, J_T, R_T, ws.active, ws.state, ws.force, ws.vectors
-        )
+            qp.A, qp.B, qp.c, transposed, rows, ws.guess[:n_rows],
+            u, x, J_T, R_T, ws.active, ws.state, ws.force, ws.vectors,
+        )  # fmt: skip
         iterations += changes
     row, slack = worst_row(u, x, rows, ws.state)
     status, iterations, q = dual_active_set(
-        A, B, c, transposed, rows, row, slack, q, iterations, iteration_limit,
+        qp.A, qp.B, qp.c, transposed, rows, row, slack, q, iterations, iteration_limit,
         u, x, J_T, R_T, ws.active, ws.state, ws.vectors,
     )  # fmt: skip
     if not (_all_finite(u) and _all_finite(x)):
         return NOT_FINITE, iterations
-    finished = _finish(A, B, c, Q, R, Q_f, x_0, r, R_rate, u_last, rows, q, ws)
+    finished = _finish(qp, rows, q, ws)
     if status != OPTIMAL:
         ws.error[0] = math.inf
         return status, iterations
     return finished, iterations
+
+
+@kernel
+def _row_data(qp: OcpQp, ws: Workspace) -> RowData:
+    """All rows of the problem, for the active set."""
+    first_move = ws.first_move
+    for a in range(N_INPUT):
+        first_move[0, a] = min(qp.u_last[a] - qp.rate_step, qp.upper[a])
+        first_move[1, a] = max(qp.u_last[a] + qp.rate_step, qp.lower[a])
+    rows = qp.rows
+    row_spans(rows.normals, ws.spans)
+    return RowData(
+        qp.lower, qp.upper, qp.rate_step, first_move,
+        rows.normals, rows.normal, rows.stage, rows.lower, rows.upper, rows.weight, ws.spans,
+    )  # fmt: skip
+
+
+@kernel
+def _is_optimal(qp: OcpQp, rows: RowData, ws: Workspace) -> bool:
+    """Whether the unconstrained plan in ws satisfies every row, and round-off has not spoiled it."""
+    if worst_row(ws.u, ws.x, rows, ws.state)[0] >= 0:
+        return False
+    if weight_of_changes(qp).shape[0] == 0 and is_mild(qp.A, qp.R, qp.Q_f, qp.c.shape[0], ws.scratch[1]):
+        return True
+    return bool(_stationarity(qp, rows, ws) <= STATIONARY)
+
+
+@kernel
+def solve_qp(qp: OcpQp, iteration_limit: int, warm: bool, ws: Workspace) -> tuple[int, int]:
+    """Solve one OCP-QP, whose R_rate is an array: (0, 4) where changes have no weight.
+
+    Nothing is allocated and nothing is validated. Compiled loops may call it, with one workspace per thread.
+    A warm start that ends without an optimum is done again cold, and a cold one that accuracy let down once
+    more from the working set that it reached.
+
+    Args:
+        qp: The problem; `stationary` is not read where changes have a weight.
+        iteration_limit: As in `step_limit`.
+        warm: Whether ws.guess[: 16N + 2K] holds a guess of the state of every row to start from.
+        ws: From `make_workspace` for this N, at least K rows and at least this many pairs; ws.u, ws.x,
+            ws.multipliers[: 16N + 2K] and ws.state[: 16N + 2K] receive the result.
+
+    Returns:
+        Status as an integer, and the number of active-set steps: changes of the unconstrained plan's or the
+        guessed working set, 0 if the Riccati plan satisfies every row.
+    """
+    N, K = qp.c.shape[0], qp.rows.normal.shape[0]
+    if (
+        ws.u.shape[0] != N
+        or ws.spans.shape[0] < max(K, qp.rows.normals.shape[0])
+        or ws.transposed.shape[0] < qp.A.shape[0]
+        or (ws.rate.size == 0 and weight_of_changes(qp).shape[0] > 0)
+    ):
+        raise ValueError(
+            "the workspace does not fit the problem: make it with its horizon, rows, pairs and weights"
+        )
+    n_rows = 4 * N_INPUT * N + 2 * K
+    _clear(ws.multipliers, n_rows)
+    _clear(ws.state, n_rows)
+    _recursion(qp, ws)
+    rows = _row_data(qp, ws)
+    last = qp.u_last[0] + qp.u_last[1] + qp.u_last[2] + qp.u_last[3]
+    finite = abs(last) < math.inf and _all_finite(qp.r)
+    limit = step_limit(iteration_limit, N, K)
+    status, iterations = NOT_FINITE, 0
+    for attempt in range(3):
+        _plan(qp, ws)
+        if not (finite and _all_finite(ws.u) and _all_finite(ws.x)):
+            return NOT_FINITE, iterations
+        if attempt == 0 and _is_optimal(qp, rows, ws):
+            return OPTIMAL, 0
+        # A warm start gets half of the steps, so that a cold one is left.
+        steps = (iterations + limit + 1) // 2 if warm and attempt == 0 else limit
+        status, iterations = _solve_rows(qp, rows, warm, iterations, steps, ws)
+        if status == OPTIMAL or iterations >= limit:
+            break
+        hard = status == INFEASIBLE and _has_hard_rows(rows)
+        if hard or (attempt > 0 and warm):
+            break
+        warm = not (warm and attempt == 0)
+        if warm:
+            for k in range(n_rows):
+                ws.guess[k] = ws.state[k]
+    if status == INFEASIBLE and not _has_hard_rows(rows):
+        status = INACCURATE  # box, rate and soft rows cannot contradict each other
+    return status, iterations
 
 
 @kernel
@@ -388,122 +486,10 @@ def solve_structured(
     warm: bool,
     ws: Workspace,
 ) -> tuple[int, int]:
-    """Solve one OCP-QP, data as in `OcpQp` and `StateRows`. Nothing is allocated and nothing is validated.
-
-    Arrays are passed one by one because that unpacks twice as fast as a NamedTuple. Compiled loops may call
-    it, with one workspace per thread. A warm start that ends without an optimum is done again cold, and a
-    cold one that accuracy let down once more from the working set that it reached.
-
-    Args:
-        A: (1 or N, 12, 12).
-        B: (1 or N, 12, 4).
-        c: (N, 12).
-        Q: (1 or N, 12, 12).
-        R: (4, 4).
-        Q_f: (12, 12).
-        stationary: Whether Q_f solves the DARE of the single pair.
-        x_0: (12,).
-        r: (N+1, 12).
-        lower: (4,).
-        upper: (4,).
-        rate_step: N per sample, inf for no limit.
-        u_last: (4,).
-        normals: (H, 12), H <= K.
-        normal: (K,).
-        stage: (K,).
-        row_lower: (K,).
-        row_upper: (K,).
-        weight: (K,).
-        R_rate: (4, 4), or (0, 4) where changes have no weight. With one, `stationary` is not read.
-        iteration_limit: As in `step_limit`.
-        warm: Whether ws.guess[: 16N + 2K] holds a guess of the state of every row to start from.
-        ws: From `make_workspace` for this N, at least K rows and at least this many pairs; ws.u, ws.x,
-            ws.multipliers[: 16N + 2K] and ws.state[: 16N + 2K] receive the result.
-
-    Returns:
-        Status as an integer, and the number of active-set steps: changes of the unconstrained plan's or the
-        guessed working set, 0 if the Riccati plan satisfies every row.
-    """
-    N, K = c.shape[0], normal.shape[0]
-    if (
-        ws.u.shape[0] != N
-        or ws.spans.shape[0] < max(K, normals.shape[0])
-        or ws.transposed.shape[0] < A.shape[0]
-        or (ws.rate.size == 0 and R_rate.shape[0] > 0)
-    ):
-        raise ValueError(
-            "the workspace does not fit the problem: make it with its horizon, rows, pairs and weights"
-        )
-    u, x, n_rows = ws.u, ws.x, 4 * N_INPUT * N + 2 * K
-    transposed = ws.transposed[: A.shape[0]]
-    _clear(ws.multipliers, n_rows)
-    _clear(ws.state, n_rows)
-    _recursion(A, B, c, Q, R, Q_f, stationary, x_0, r, R_rate, u_last, ws)
-    first_move = ws.first_move
-    for a in range(N_INPUT):
-        first_move[0, a] = min(u_last[a] - rate_step, upper[a])
-        first_move[1, a] = max(u_last[a] + rate_step, lower[a])
-    row_spans(normals, ws.spans)
-    rows = RowData(
-        lower, upper, rate_step, first_move,
-        normals, normal, stage, row_lower, row_upper, weight, ws.spans,
-    )  # fmt: skip
-    last = u_last[0] + u_last[1] + u_last[2] + u_last[3]
-    finite = abs(last) < math.inf and _all_finite(r)
-    limit = step_limit(iteration_limit, N, K)
-    status, iterations = NOT_FINITE, 0
-    for attempt in range(3):
-        if R_rate.shape[0] > 0:
-            rate = carve_rate(ws.rate, N, ws.transposed.shape[0])
-            rate_plan(A.shape[0], Q.shape[0], ws.D, rate, u, x)
-        else:
-            optimal_plan(
-                B, c, Q, Q_f, x_0, r, stationary, transposed, ws.K, ws.D, ws.A_cl, ws.P_c, u, x, ws.scratch
-            )
-        if not (finite and _all_finite(u) and _all_finite(x)):
-            return NOT_FINITE, iterations
-        if attempt == 0 and worst_row(u, x, rows, ws.state)[0] < 0:
-            if R_rate.shape[0] == 0 and is_mild(A, R, Q_f, N, ws.scratch[1]):
-                return OPTIMAL, 0
-            relative = lagrangian_gradient(
-                A,
-                B,
-                c,
-                Q,
-                R,
-                Q_f,
-                x_0,
-                r,
-                R_rate,
-                u_last,
-                transposed,
-                rows,
-                u,
-                ws.multipliers,
-                ws.states,
-                ws.force,
-                ws.gradient,
-                ws.scratch[1],
-            )
-            if relative <= STATIONARY:
-                return OPTIMAL, 0
-        # A warm start gets half of the steps, so that a cold one is left.
-        steps = (iterations + limit + 1) // 2 if warm and attempt == 0 else limit
-        status, iterations = _solve_rows(
-            A, B, c, Q, R, Q_f, stationary, x_0, r, R_rate, u_last, rows, warm, iterations, steps, ws
-        )
-        if status == OPTIMAL or iterations >= limit:
-            break
-        hard = status == INFEASIBLE and _has_hard_rows(rows)
-        if hard or (attempt > 0 and warm):
-            break
-        warm = not (warm and attempt == 0)
-        if warm:
-            for k in range(n_rows):
-                ws.guess[k] = ws.state[k]
-    if status == INFEASIBLE and not _has_hard_rows(rows):
-        status = INACCURATE  # box, rate and soft rows cannot contradict each other
-    return status, iterations
+    """`solve_qp` for calls from Python: fields of `OcpQp` and `StateRows` one by one unpack twice as fast."""
+    rows = StateRows(normals, normal, stage, row_lower, row_upper, weight)
+    qp = OcpQp(A, B, c, Q, R, Q_f, stationary, x_0, r, lower, upper, rate_step, u_last, rows, R_rate)
+    return solve_qp(qp, iteration_limit, warm, ws)
 
 
 class StructuredSolver:

@@ -34,9 +34,10 @@ from .active_set import (
     solve_triangle,
     solve_triangle_transposed,
 )
-from .linalg import add_matvec_transposed, fill
+from .linalg import fill
 from .ocp import IntArray
-from .riccati import step_plan
+from .products import add_matvec_transposed
+from .recursion import step_plan
 
 BASE = 5
 DIGITS = 22  # 5^22 is the last power of 5 that a float64 counts up to exactly
