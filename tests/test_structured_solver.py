@@ -17,7 +17,8 @@ from controllers.qp.ocp import (
     rate_weight,
 )
 from controllers.qp.recursion import Feedback
-from controllers.qp.structured import inverse_factor, make_workspace, solve_structured
+from controllers.qp.structured import inverse_factor, solve_structured
+from controllers.qp.workspace import make_workspace
 
 SOLVER = StructuredSolver()
 FAR = np.r_[3.0, 3.0, 3.0, np.zeros(9)]

@@ -9,8 +9,9 @@ import quad_envs  # noqa: F401  registers the ids
 from baselines import check_policy, make_policy
 from controllers.qp import Status, StructuredSolver
 from controllers.qp.ocp import rate_weight
-from controllers.qp.structured import ITERATION_LIMIT, make_workspace, solve_structured, step_limit
+from controllers.qp.structured import ITERATION_LIMIT, solve_structured, step_limit
 from controllers.qp.working_set import DIGITS, pack_working_set, unpack_working_set
+from controllers.qp.workspace import make_workspace
 
 SOLVER = StructuredSolver()
 

@@ -7,9 +7,9 @@ out the second derivatives of e.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
-from quad_envs._numba import kernel
+from quad_envs._numba import entry_of, kernel
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 from quad_envs.rotations import sincos, wrap_angle_scalar
 from quad_envs.tasks import Task
@@ -17,9 +17,10 @@ from quad_envs.tasks import Task
 from ..controller import first_non_finite
 from ..fallback import RELAXED
 from ..model import RK4_SCRATCH, rk4_sensitivities, rotated_derivatives
+from ..packed import unpacker
 from ..qp.linalg import copy, fill
 from ..qp.ocp import IntArray
-from ..qp.structured import Workspace
+from ..qp.workspace import Workspace
 from .kernels import (
     MpcData,
     Scratch,
@@ -216,6 +217,20 @@ def keep_guess(valid: bool, X: Array, kept: Array) -> None:
         copy(X, kept[1:].reshape(X.shape))
 
 
+class _Call(NamedTuple):
+    """What a decision takes beside its rows."""
+
+    passes: int
+    inertial: bool  # as of `linearise_cost`
+    keep_from: int  # where the guess begins in memory
+    data: MpcData
+    buffer: Annotated[Array, "numbers"]
+    ws: Workspace
+
+
+_unpack = unpacker(_Call)
+
+
 @kernel
 def _decide_rows(
     plants: Array,
@@ -227,14 +242,10 @@ def _decide_rows(
     kept: Array,
     report: IntArray,
     which: IntArray | None,
-    passes: int,
-    inertial: bool,
-    keep_from: int,
-    data: MpcData,
-    buffer: Array,
-    ws: Workspace,
+    words: IntArray,
 ) -> int:
     """One decision per row; -1, or the code of the first argument that is not finite."""
+    passes, inertial, keep_from, data, buffer, ws = _unpack(words)
     N = ws.u.shape[0]
     bad = first_non_finite(plants, windows, lasts, disturbances, memories, N + 1)
     if bad >= 0:
@@ -275,6 +286,7 @@ class ExactNmpc(Mpc):
 
     options_type = NmpcOptions
     options: NmpcOptions
+    _kernel = staticmethod(entry_of(_decide_rows))
 
     def __init__(self, task: Task, options: NmpcOptions | None = None, **changes: Any) -> None:
         options = chosen(NmpcOptions, options, changes)
@@ -283,11 +295,8 @@ class ExactNmpc(Mpc):
         self.passes = int(options.passes)
         self._inertial = options.velocity_error == "inertial"
 
-    def _decide_rows(self, *arrays: Any) -> int:
-        which, buffer, ws = self._scratch()
-        constants = (which, self.passes, self._inertial, self._keep_from, self._data, buffer, ws)
-        arguments: tuple[Any, ...] = (*arrays, *constants)
-        return _decide_rows(*arguments)
+    def _call(self, buffer: Array, ws: Workspace) -> _Call:
+        return _Call(self.passes, self._inertial, self._keep_from, self._data, buffer, ws)
 
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
         if number == 0:

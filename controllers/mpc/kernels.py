@@ -9,7 +9,7 @@ Memory of one vehicle: whether a plan is held, the plan's rotor commands (N x 4)
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from quad_envs._numba import kernel
 from quad_envs.parameters import HOVER_FORCE, N_INPUT, N_STATE, Array
@@ -22,8 +22,9 @@ from ..qp.active_set import INACCURATE, INFEASIBLE, OPTIMAL
 from ..qp.linalg import copy, take, take_blocks
 from ..qp.ocp import IntArray, OcpQp, StateRows
 from ..qp.riccati import DARE_SCRATCH
-from ..qp.structured import Workspace, solve_qp
+from ..qp.structured import solve_qp
 from ..qp.working_set import pack_working_set, unpack_working_set
+from ..qp.workspace import Workspace
 from .present_axes import body_outputs
 
 MEMORY_STAGE = N_INPUT + 1  # numbers that a plan and its working set take per stage
@@ -35,31 +36,31 @@ _CLOSE = 1e-4  # of the largest force, and of a row: below what a model knows, a
 class MpcData(NamedTuple):
     """Constants of one controller, for compiled code."""
 
-    coefficients: Array  # (N_COEFFICIENTS,)
-    B_c: Array  # (12, 4)
-    Q: Array  # (1, 12, 12)
-    R: Array  # (4, 4)
-    R_rate: Array  # (4, 4), or (0, 4) for none
-    P: Array  # (12, 12), weight of x_N: solves the Riccati equation of the hover pair
-    normals: Array  # (H, 12), outputs with limits
-    axis: IntArray  # (H,), 0..2 where the output is that coordinate of the position, else -1
-    normal: IntArray  # (K,)
-    stage: IntArray  # (K,)
-    lower: Array  # (K,)
-    upper: Array  # (K,)
-    weight: Array  # (K,)
+    coefficients: Annotated[Array, "N_COEFFICIENTS"]
+    B_c: Annotated[Array, "12, 4"]
+    Q: Annotated[Array, "1, 12, 12"]
+    R: Annotated[Array, "4, 4"]
+    R_rate: Annotated[Array, "4 or 0, 4"]  # 0 for none
+    P: Annotated[Array, "12, 12"]  # weight of x_N: solves the Riccati equation of the hover pair
+    normals: Annotated[Array, "H, 12"]  # outputs with limits
+    axis: Annotated[IntArray, "H"]  # 0..2 where the output is that coordinate of the position, else -1
+    normal: Annotated[IntArray, "K"]
+    stage: Annotated[IntArray, "K"]
+    lower: Annotated[Array, "K"]
+    upper: Annotated[Array, "K"]
+    weight: Annotated[Array, "K"]
     dt: float
-    force_max: Array  # (4,), N
+    force_max: Annotated[Array, "4"]  # N
     rate_step: float
     lag: float  # of slow rotors, s, see `frame.rotor_lag`
-    gain: Array  # (6,), of the disturbance estimator, 0 for none
+    gain: Annotated[Array, "6"]  # of the disturbance estimator, 0 for none
     heading: bool  # whether the problem is posed at the present position and heading
     attitude: bool  # whether v_ref is turned into the present body axes
     level: bool  # whether the model's velocity stands in level axes, as v_ref, instead of in body axes
     present: bool  # whether it stands in those of the present attitude, which do not turn along a plan
     kinematics: bool  # whether the model turns body rates into Euler rates at the present attitude
     iteration_limit: int
-    plan_bound: Array  # (12,), magnitude of each state where the plan's own rows begin, inf for none
+    plan_bound: Annotated[Array, "12"]  # magnitude of a state where the plan's own rows begin, inf: none
     own_outputs: int  # outputs and rows of the task's limits, which stand first
     own_rows: int
     model_tilt: float  # rad, roll and pitch up to which the model holds

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from quad_envs._numba import kernel
+from quad_envs._numba import entry_of, kernel
 from quad_envs.parameters import ATTITUDE, Array
 from quad_envs.tasks import Task
 
 from ..controller import first_non_finite
 from ..model import hover_pair
+from ..packed import unpacker
 from ..qp.ocp import IntArray
-from ..qp.structured import Workspace
+from ..qp.workspace import Workspace
 from .kernels import (
     MpcData,
     Scratch,
@@ -28,6 +29,20 @@ from .mpc import Mpc, Problem
 from .options import LmpcOptions, chosen
 
 
+class _Call(NamedTuple):
+    """What a decision takes beside its rows."""
+
+    A: Annotated[Array, "1, 12, 12"]
+    B: Annotated[Array, "1, 12, 4"]
+    stationary: bool  # whether data.P solves the Riccati equation of the pair
+    data: MpcData
+    buffer: Annotated[Array, "numbers"]
+    ws: Workspace
+
+
+_unpack = unpacker(_Call)
+
+
 @kernel
 def _decide_rows(
     plants: Array,
@@ -39,14 +54,10 @@ def _decide_rows(
     kept: Array,
     report: IntArray,
     which: IntArray | None,
-    A: Array,
-    B: Array,
-    stationary: bool,
-    data: MpcData,
-    buffer: Array,
-    ws: Workspace,
+    words: IntArray,
 ) -> int:
     """One decision per row; -1, or the code of the first argument that is not finite."""
+    A, B, stationary, data, buffer, ws = _unpack(words)
     N = ws.u.shape[0]
     bad = first_non_finite(plants, windows, lasts, disturbances, memories, N + 1)
     if bad >= 0:
@@ -84,6 +95,7 @@ class LinearMPC(Mpc):
 
     options_type = LmpcOptions
     options: LmpcOptions
+    _kernel = staticmethod(entry_of(_decide_rows))
 
     def __init__(self, task: Task, options: LmpcOptions | None = None, **changes: Any) -> None:
         options = chosen(LmpcOptions, options, changes)
@@ -92,19 +104,8 @@ class LinearMPC(Mpc):
         A, B = hover_pair(task.params, task.dt)
         self._A, self._B = np.ascontiguousarray(A[None]), np.ascontiguousarray(B[None])
 
-    def _decide_rows(self, *arrays: Any) -> int:
-        which, buffer, ws = self._scratch()
-        arguments: tuple[Any, ...] = (
-            *arrays,
-            which,
-            self._A,
-            self._B,
-            not self.options.own_terminal,
-            self._data,
-            buffer,
-            ws,
-        )
-        return _decide_rows(*arguments)
+    def _call(self, buffer: Array, ws: Workspace) -> _Call:
+        return _Call(self._A, self._B, not self.options.own_terminal, self._data, buffer, ws)
 
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
         hold_trim(self._A, s.trim, s.c)

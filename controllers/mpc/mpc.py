@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,10 +19,11 @@ from ..disturbance import ESTIMATOR_SIZE, N_DISTURBANCE
 from ..fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXED_WEIGHT
 from ..frame import rotor_lag
 from ..model import hover_pair
+from ..packed import pack
 from ..qp import Backend, Status, StructuredSolver
 from ..qp.ocp import IntArray, OcpQp, StateRows, concatenate_rows, no_rows, output_rows
 from ..qp.riccati import dare
-from ..qp.structured import Workspace, make_workspace
+from ..qp.workspace import Workspace, make_workspace
 from .estimator_gain import estimator_gains
 from .kernels import (
     MEMORY_STAGE,
@@ -39,6 +41,16 @@ from .weights import change_weight, require_turnable, terminal_weight, weight_ma
 
 PLAN_WEIGHT = 1e4  # per rad, rad/s: of rows that keep a plan in its model; 1e3 gives way to heavy positions
 YAW_SHARE = 0.5  # of it for yaw: the axes of the problem stay where the heading is now
+
+
+class _Memory(NamedTuple):
+    """What a thread decides with."""
+
+    which: IntArray | None  # what `begin_row` takes for the estimator
+    buffer: Array  # of `carve`
+    ws: Workspace
+    call: Any  # what lies behind the words
+    words: IntArray  # all that a kernel takes beside its rows
 
 
 class Problem(NamedTuple):
@@ -151,6 +163,7 @@ class Mpc(ABC):
     """
 
     options: MpcOptions
+    _kernel: Callable[..., int]  # the whole batch in one compiled call
 
     def __init__(
         self, task: Task, options: MpcOptions, axes: VelocityAxes, *, many_pairs: bool, guess: bool
@@ -165,7 +178,7 @@ class Mpc(ABC):
             1 + MEMORY_STAGE * self.horizon + (ESTIMATOR_SIZE if options.reject_disturbance else 0)
         )
         self.memory_size = self._keep_from + (1 + N_STATE * (self.horizon + 1) if guess else 0)
-        self._workspace: tuple[IntArray | None, Array, Workspace] | None = None
+        self._memory: _Memory | None = None
         self._backend: Backend | None = None
 
     def decide(
@@ -185,7 +198,8 @@ class Mpc(ABC):
             np.empty((3, n), np.int64),
         )
         if self.options.solver == "structured":
-            bad = self._decide_rows(*arrays, command, kept, report)
+            scratch = self._scratch()
+            bad = self._kernel(*arrays, command, kept, report, scratch.which, scratch.words)
         else:
             bad = self._decide_by_backend(*arrays, command, kept, report)
         if bad >= 0:
@@ -209,7 +223,7 @@ class Mpc(ABC):
             ValueError: If a shape is wrong or a number is not finite.
         """
         row = as_one_row(plant, window, last_command, disturbance, memory, self.horizon + 1, self.memory_size)
-        which, buffer, ws = self._scratch()
+        which, buffer, ws, *_ = self._scratch()
         s = carve(buffer, self.horizon, *self._sizes())
         begin_row(*row, which, self._data, s)
         qp = self._as_qp(self._pose(0, row[-1], s, ws), s, *self._row_sets()[0])
@@ -218,8 +232,8 @@ class Mpc(ABC):
         return OcpQp._make(np.array(v) if isinstance(v, np.ndarray) else v for v in qp)
 
     @abstractmethod
-    def _decide_rows(self, *arrays: Any) -> int:
-        """The whole batch in one compiled call."""
+    def _call(self, buffer: Array, ws: Workspace) -> Any:
+        """What the kernel takes beside its rows, a NamedTuple for `pack`."""
 
     @abstractmethod
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
@@ -232,15 +246,16 @@ class Mpc(ABC):
     def _keep(self, level: int, kept: Array, s: Scratch) -> None:  # noqa: B027  most flavours keep nothing
         """Write what the flavour remembers."""
 
-    def _scratch(self) -> tuple[IntArray | None, Array, Workspace]:
-        """What `begin_row` takes for the estimator, the flat buffer, the solver's memory; made at need."""
-        if self._workspace is None:
-            self._workspace = (
-                np.zeros(1, np.int64) if self.options.reject_disturbance else None,
-                np.zeros(buffer_size(self.horizon, *self._sizes())),
-                make_workspace(self.horizon, len(self._data.normal), self._pairs, len(self._data.R_rate) > 0),
-            )
-        return self._workspace
+    def _scratch(self) -> _Memory:
+        """Scratch memory, made at need."""
+        if self._memory is None:
+            which = np.zeros(1, np.int64) if self.options.reject_disturbance else None
+            buffer = np.zeros(buffer_size(self.horizon, *self._sizes()))
+            rows, weighs_changes = len(self._data.normal), len(self._data.R_rate) > 0
+            ws = make_workspace(self.horizon, rows, self._pairs, weighs_changes)
+            call = self._call(buffer, ws)
+            self._memory = _Memory(which, buffer, ws, call, pack(call))
+        return self._memory
 
     def _sizes(self) -> tuple[int, int, int, int]:
         """Pairs, outputs, rows, stages of the guess."""
@@ -252,7 +267,7 @@ class Mpc(ABC):
         bad = first_non_finite(plants, windows, lasts, disturbances, memories, self.horizon + 1)
         if bad >= 0:
             return bad
-        which, buffer, ws = self._scratch()
+        which, buffer, ws, *_ = self._scratch()
         s = carve(buffer, self.horizon, *self._sizes())
         for j in range(len(plants)):
             row = plants[j], windows[j], lasts[j], disturbances[j], memories[j]
@@ -332,4 +347,4 @@ class Mpc(ABC):
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but scratch memory and the backend's, which are made again when needed."""
-        return {**self.__dict__, "_workspace": None, "_backend": None}
+        return {**self.__dict__, "_memory": None, "_backend": None}

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
-from quad_envs._numba import kernel
+from quad_envs._numba import entry_of, kernel
 from quad_envs.parameters import N_STATE, Array
 from quad_envs.tasks import Task
 
 from ..controller import first_non_finite
 from ..fallback import RELAXED
 from ..model import sdc_matrix, zero_order_hold
+from ..packed import unpacker
 from ..qp.linalg import copy
 from ..qp.ocp import IntArray
 from ..qp.riccati import solve_dare
-from ..qp.structured import Workspace
+from ..qp.workspace import Workspace
 from .kernels import (
     FROZEN_SPAN,
     MpcData,
@@ -125,6 +126,22 @@ def leaves_pair(x: Array) -> bool:
     return False
 
 
+class _Call(NamedTuple):
+    """What a decision takes beside its rows."""
+
+    alpha: float
+    present: bool  # whether velocities stand in axes of the present attitude
+    relinearisations: int  # passes after the first one, at most
+    at_need: bool  # whether a further pass is made only where the plan needs it
+    sdre_weight: bool  # whether the terminal weight is that of the present pair
+    data: MpcData
+    buffer: Annotated[Array, "numbers"]
+    ws: Workspace
+
+
+_unpack = unpacker(_Call)
+
+
 @kernel
 def _decide_rows(
     plants: Array,
@@ -136,16 +153,10 @@ def _decide_rows(
     kept: Array,
     report: IntArray,
     which: IntArray | None,
-    alpha: float,
-    present: bool,
-    relinearisations: int,
-    at_need: bool,
-    sdre_weight: bool,
-    data: MpcData,
-    buffer: Array,
-    ws: Workspace,
+    words: IntArray,
 ) -> int:
     """One decision per row; -1, or the code of the first argument that is not finite."""
+    alpha, present, relinearisations, at_need, sdre_weight, data, buffer, ws = _unpack(words)
     N = ws.u.shape[0]
     bad = first_non_finite(plants, windows, lasts, disturbances, memories, N + 1)
     if bad >= 0:
@@ -195,6 +206,7 @@ class SdcNmpc(Mpc):
 
     options_type = SdcOptions
     options: SdcOptions
+    _kernel = staticmethod(entry_of(_decide_rows))
 
     def __init__(self, task: Task, options: SdcOptions | None = None, **changes: Any) -> None:
         options = chosen(SdcOptions, options, changes)
@@ -206,21 +218,9 @@ class SdcNmpc(Mpc):
         self._at_need = options.at_need
         self._sdre_weight = options.terminal_weight == "sdre"
 
-    def _decide_rows(self, *arrays: Any) -> int:
-        which, buffer, ws = self._scratch()
-        constants = (
-            which,
-            self.alpha,
-            self._present,
-            self.relinearisations,
-            self._at_need,
-            self._sdre_weight,
-            self._data,
-            buffer,
-            ws,
-        )
-        arguments: tuple[Any, ...] = (*arrays, *constants)
-        return _decide_rows(*arguments)
+    def _call(self, buffer: Array, ws: Workspace) -> _Call:
+        passes = self.relinearisations, self._at_need
+        return _Call(self.alpha, self._present, *passes, self._sdre_weight, self._data, buffer, ws)
 
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
         stationary, pairs = False, 1

@@ -12,17 +12,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from quad_envs._numba import kernel
-from quad_envs.parameters import N_INPUT, N_STATE, Array
+from quad_envs.parameters import N_INPUT, Array
 
 from .active_set import (
     INACCURATE,
     INFEASIBLE,
-    N_VECTORS,
     NOT_FINITE,
     OPTIMAL,
     ROW_TOLERANCE,
@@ -39,85 +38,16 @@ from .active_set import (
 from .linalg import fill
 from .ocp import IntArray, OcpQp, StateRows, rate_weight, validate, weight_of_changes
 from .products import add_product, negate, transpose
-from .rate_weight import carve_rate, rate_pass, rate_plan, rate_size
-from .recursion import RECURSION_SCRATCH, Feedback, Regulator, optimal_plan, riccati_pass, step_plan
+from .rate_weight import carve_rate, rate_pass, rate_plan
+from .recursion import Feedback, Regulator, optimal_plan, riccati_pass, step_plan
 from .solution import Multipliers, Solution, Status
 from .stationarity import REFINED, STATIONARY, is_mild, lagrangian_gradient
 from .working_set import correct, start_from_guess
+from .workspace import Workspace, make_workspace
 
 ITERATION_LIMIT = 0  # stands for a limit that grows with the problem, `step_limit`
 _STEPS, _STEPS_PER_ROW = 2000, 20  # random problems with horizons up to 60 stay below
 _ROW_ERROR = 1e-7  # largest violation of a row that a refined solution may have, as `STATIONARY`
-
-
-class Workspace(NamedTuple):
-    """Memory of `solve_structured` for one horizon; the first three fields hold its results."""
-
-    u: Array  # (N, 4)
-    x: Array  # (N+1, 12)
-    multipliers: Array  # (16N + 2K,): box lower, box upper, rate lower, rate upper, rows lower, rows upper
-    transposed: Array  # (1 or N, 16, 12), [A_i B_i]'
-    K: Array  # (N, 4, 12), gains
-    D: Array  # (N, 4, 4), inverse Cholesky factors
-    P_c: Array  # (N, 12)
-    first_move: Array  # (2, 4), bounds on u_0
-    scratch: Array  # (RECURSION_SCRATCH, 12, 12)
-    wide: Array  # (2, 12, 4N)
-    factors: Array  # (2, 4N, 4N): J and R, by columns
-    vectors: Array  # (N_VECTORS, 4N + 12)
-    gradient: Array  # (4N,), of the Lagrangian
-    force: Array  # (N+1, 12)
-    states: Array  # (N+1, 12)
-    active: IntArray  # (4N + 1,)
-    spans: IntArray  # (K, 2)
-    state: ByteArray  # (16N + 2K,), of every row at the end
-    guess: ByteArray  # (16N + 2K,), of every row, to start from
-    error: Array  # (2,), left after refinement: by how much another would move an input, and gaps of rows
-    rate: Array  # of a weight on changes, see `carve_rate`; may be empty
-
-
-def make_workspace(horizon: int, n_rows: int, n_models: int, weighs_changes: bool = False) -> Workspace:
-    """Memory for `solve_structured`.
-
-    Args:
-        horizon: N, exactly.
-        n_rows: Largest number K of state rows.
-        n_models: Number of pairs (A_i, B_i), 1 or N.
-        weighs_changes: Whether changes of the input may have a weight.
-
-    Raises:
-        ValueError: If a size is out of range.
-    """
-    if horizon < 1 or n_rows < 0 or n_models not in (1, horizon):
-        raise ValueError(
-            f"a workspace needs horizon >= 1, n_rows >= 0 and n_models 1 or {horizon}, "
-            f"got {horizon}, {n_rows}, {n_models}"
-        )
-    N, n, m = horizon, N_STATE, N_INPUT
-    nv = N * m
-    return Workspace(
-        u=np.zeros((N, m)),
-        x=np.zeros((N + 1, n)),
-        multipliers=np.zeros(4 * nv + 2 * n_rows),
-        transposed=np.zeros((n_models, n + m, n)),
-        K=np.zeros((N, m, n)),
-        D=np.zeros((N, m, m)),
-        P_c=np.zeros((N, n)),
-        first_move=np.zeros((2, m)),
-        scratch=np.zeros((RECURSION_SCRATCH, n, n)),
-        wide=np.zeros((2, n, nv)),
-        factors=np.zeros((2, nv, nv)),
-        vectors=np.zeros((N_VECTORS, nv + n)),
-        gradient=np.zeros(nv),
-        force=np.zeros((N + 1, n)),
-        states=np.zeros((N + 1, n)),
-        active=np.zeros(nv + 1, dtype=np.int64),
-        spans=np.zeros((n_rows, 2), dtype=np.int64),
-        state=np.zeros(4 * nv + 2 * n_rows, dtype=np.int8),
-        guess=np.zeros(4 * nv + 2 * n_rows, dtype=np.int8),
-        error=np.zeros(2),
-        rate=np.zeros(rate_size(N, n_models) if weighs_changes else 0),
-    )
 
 
 @kernel

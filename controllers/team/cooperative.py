@@ -28,7 +28,7 @@ from ..mpc.kernels import MEMORY_STAGE, buffer_size, carve
 from ..mpc.mpc import mpc_data
 from ..mpc.options import MpcOptions, chosen, shared
 from ..qp.ocp import IntArray, OcpQp, StateRows, concatenate_rows
-from ..qp.structured import make_workspace
+from ..qp.workspace import make_workspace
 from .collision import COLLISION_SCRATCH
 from .consensus import require_messages
 from .consensus_kernels import CONSENSUS_SCRATCH

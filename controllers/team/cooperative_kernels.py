@@ -26,7 +26,7 @@ from ..mpc.kernels import (
 )
 from ..qp.linalg import copy
 from ..qp.ocp import IntArray
-from ..qp.structured import Workspace
+from ..qp.workspace import Workspace
 from .collision import COLLISION_SCRATCH, AvoidanceData, separation_rows
 from .consensus_kernels import ConsensusData, consensus_row, inertial_velocity, turn_to_inertial
 
