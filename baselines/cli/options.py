@@ -69,7 +69,7 @@ class BenchmarkOptions:
     episodes: Annotated[int | None, "flights per environment and policy, instead of the suite's"] = None
     seed: Annotated[int | None, "environment seed of the first flight, instead of the suite's"] = None
     engine: Annotated[str, "who runs the units: processes, ray or dask"] = "processes"
-    jobs: Annotated[int, "units flown at a time; more than one disturbs decision times"] = 1
+    jobs: Annotated[int, "units flown at a time"] = 1
     fresh: Annotated[bool, "discard what the folder holds of an earlier run, but for networks"] = False
     networks: Annotated[Path | None, "where networks that the suite trains are or go; OUT/networks"] = None
     quick: Annotated[bool, "a small part of the suite, to see it work"] = False

@@ -134,7 +134,13 @@ class Record(NamedTuple):
     ]
     decision_p50_ms: Annotated[
         float,
-        Column("Decision p50", "ms", "wall time of a decision per vehicle, median", LESS | TIMED, "p50"),
+        Column(
+            *("Decision p50", "ms"),
+            "wall time per vehicle of a decision, median: single ones in short flights from 20 starts that "
+            "serve nothing else, or all where flights go one at a time",
+            LESS | TIMED,
+            "p50",
+        ),
     ]  # nan if not timed
     decision_p99_ms: Annotated[
         float, Column("Decision p99", "ms", "its 99th percentile", LESS | TIMED, "p99")

@@ -14,7 +14,7 @@ from ..errors import PolicyError
 from ..policies.blame import place_of, place_where_defined, told
 from ..policies.protocol import Policy
 from ..policies.registry import policy_name
-from .episode import Recorder
+from .recorder import Recorder
 
 _SUITE = ("baselines", "controllers", "quad_envs")  # whose errors say all there is to say
 
@@ -97,18 +97,24 @@ def _place(policy: Policy, recorder: Recorder, row: int) -> str:
     """Which policy, where."""
     agent = recorder.agents[row]
     who = f"row {row}" + (f" ({agent})" if agent else "")
-    return (
-        f"policy {policy_name(policy)!r}, {who} from seed {recorder.seeds[row]}, step {len(recorder.steps)}"
-    )
+    step = recorder.steps[row]
+    return f"policy {policy_name(policy)!r}, {who} from seed {recorder.seeds[row]}, step {step}"
 
 
 def _broken(policy: Policy, recorder: Recorder, what: str, line: str = "") -> PolicyError:
     """The error for what a policy did to all rows, with the line of its file."""
-    first, last = recorder.seeds[0], recorder.seeds[-1]
-    when = f"seed {first}" if first == last else f"seeds {first} to {last}"
+    flown = recorder.live if recorder.live.any() else np.ones_like(recorder.live)
+    seeds, steps = np.array(recorder.seeds)[flown], recorder.steps[flown]
+    when = f"{_span('seed', seeds)}, {_span('step', steps)}"
     line = line or place_where_defined(getattr(policy, "predict", policy))
-    said = f"policy {policy_name(policy)!r}, from {when}, step {len(recorder.steps)}: {what}"
+    said = f"policy {policy_name(policy)!r}, from {when}: {what}"
     return PolicyError(f"{said}; {line}" if line else said)
+
+
+def _span(what: str, values: NDArray[np.int64]) -> str:
+    """A number, or the first and the last, in words."""
+    first, last = int(values.min()), int(values.max())
+    return f"{what} {first}" if first == last else f"{what}s {first} to {last}"
 
 
 def _kind(answer: Any) -> str:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
+from quad_envs.parameters import Array
 from quad_envs.tasks import BaseTask, TeamTask
 
 from ..files import plain_json
@@ -18,6 +19,7 @@ from ..policies.protocol import Policy
 from ..policies.registry import make_policy, policy_name
 from .column import CUT_SHORT
 from .columns import COLUMNS, Record, read_record
+from .episode import Episode
 from .metrics import (
     Estimate,
     crash_causes,
@@ -28,7 +30,9 @@ from .metrics import (
     totals,
     worst_violations,
 )
-from .rollout import Episode, is_privileged, run_episodes
+from .rollout import check_flights, is_privileged, run_episodes, time_decisions, with_times
+from .row_forms import has_row_form, row_form
+from .rows import row_episodes
 from .table import Table, format_number
 from .team_metrics import by_flight, flight_values, has_team
 
@@ -168,6 +172,10 @@ def _times(quantiles: tuple[float, float, float]) -> str:
     return f"p50 {p50} ms, p99 {p99} ms, max {slowest} ms"
 
 
+def _side_by_side(policy: Policy, env: Any, episodes: int, seed: int) -> Iterator[Episode]:
+    return row_episodes(policy, row_form(env, episodes), episodes, seed, refill=True)
+
+
 def fly_and_measure(
     policy: Policy | Any,
     env: Any,
@@ -176,20 +184,24 @@ def fly_and_measure(
     on_episode: Callable[[Episode], None] | None = None,
     *,
     mismatch: bool = False,
+    timed: Sequence[Array] | None = None,
 ) -> Evaluation:
     """What `evaluate` does where nothing is to be written.
 
-    Only numbers are kept of each flight, so that memory does not grow with its length. A team gives one
-    record per vehicle and flight; means and intervals are over flights.
+    Flights go side by side where there is a row form, see `row_forms`. Only numbers are kept of each. A team
+    gives one record per vehicle and flight; means and intervals are over flights.
 
     Args:
         policy: Anything with `predict`, or what `make_policy` takes.
-        env: An id, a Gymnasium environment or a ParallelEnv (decisions are timed), or a vector environment.
+        env: An id, a Gymnasium environment or a ParallelEnv, or a vector environment (decisions are not
+            timed).
         episodes: Number of flights, >= 1.
         seed: Flight i starts with the environment seed `seed + i`.
         on_episode: Called with each flight, of a team with that of each vehicle, to save or plot it.
         mismatch: Whether the policy may be one of another task on purpose, see `run_episodes`. Conditions
             with `randomize` need it not: the task knows the nominal vehicle.
+        timed: Decision times that `time_decisions` has found; None to find them now, where flights go side by
+            side.
 
     Raises:
         ValueError: If the id or the policy's name is unknown, episodes < 1, or as `run_episodes` says.
@@ -197,22 +209,29 @@ def fly_and_measure(
     env, size = make_env(env) if isinstance(env, str) else env, 1
     name = policy if isinstance(policy, str) else ""
     policy = policy if is_policy(policy) else make_policy(policy, env)
-    records, times, team_times = [], [], []
-    for episode in run_episodes(policy, env, episodes, seed, mismatch=mismatch):
+    check_flights(policy, env, episodes, seed, mismatch)
+    if has_row_form(policy, env):
+        timed = time_decisions(policy, env, seed) if timed is None else timed
+        flights = with_times(_side_by_side(policy, env, int(episodes), seed), seed, timed)
+    else:
+        timed, flights = None, run_episodes(policy, env, episodes, seed, mismatch=mismatch)
+    records, times = [], []
+    for episode in flights:
         records.append(measure(episode))
         size = episode.team_size
-        times.append(episode.decision_times.astype(np.float32))
-        team_times.append(size * times[-1])
+        if timed is None:
+            times.append(episode.decision_times.astype(np.float32))
         if on_episode is not None:
             on_episode(episode)
+    seconds = np.concatenate(times if timed is None else timed, dtype=np.float64)
     task: BaseTask = env.unwrapped.task
     return Evaluation(
         env_id=task.env_id,
         policy=policy_name(policy, name),
         seed=seed,
         records=tuple(records),
-        decision_ms=decision_quantiles(np.concatenate(times)),
-        team_ms=decision_quantiles(np.concatenate(team_times)) if size > 1 else _NOT_TIMED,
+        decision_ms=decision_quantiles(seconds),
+        team_ms=decision_quantiles(size * seconds) if size > 1 else _NOT_TIMED,
         vehicles=size,
         spanning_tree=task.spanning_tree if isinstance(task, TeamTask) else None,
         privileged=is_privileged(policy),

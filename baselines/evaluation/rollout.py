@@ -5,9 +5,8 @@ Episode i starts with the environment seed `seed + i`, whatever the policy: poli
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -25,12 +24,15 @@ from ..policies.pairing import require_pair
 from ..policies.protocol import Policy
 from .amounts import require_episodes
 from .deciding import decide
-from .episode import INFO, Episode, Recorder, Said
+from .episode import Episode
+from .recorder import INFO, Begun, Recorder, Said
+from .rows import plants_of, row_episodes
 from .team_signals import TEAM_INFO, WRAPPER_INFO
 
 __all__ = ["Episode", "is_privileged", "run_episodes"]
 
 _KEPT = (*INFO, *TEAM_INFO, *WRAPPER_INFO)
+TIMED_STARTS, TIMED_STEPS = 20, 20  # flights in which decisions are timed, and of each the first ones
 _WARM_UP_CALLS = 2  # the first compiles, the second takes the path with a state
 
 
@@ -60,6 +62,16 @@ def run_episodes(
             resets in the same step, or a privileged policy cannot see the truth. In flight if an observation
             or an action is not finite, with the row, its seed and the step.
     """
+    check_flights(policy, env, episodes, seed, mismatch)
+    return _episodes(policy, env, int(episodes), seed)
+
+
+def check_flights(policy: Policy, env: Any, episodes: int, seed: int, mismatch: bool) -> None:
+    """What `run_episodes` checks before the first flight.
+
+    Raises:
+        ValueError: As there.
+    """
     require_episodes("episodes", episodes)
     require_whole("seed", seed, 0)
     require_own_task(env)
@@ -69,24 +81,56 @@ def run_episodes(
             f"{type(policy).__name__} decides from the truth about one team: fly it in a ParallelEnv, "
             f"got {shown(env)}"
         )
+    if isinstance(env, VectorEnv) and env.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP:
+        raise ValueError("autoreset_mode SAME_STEP hides the last state; use NEXT_STEP or DISABLED")
+
+
+def time_decisions(policy: Policy, env: Any, seed: int = 0) -> tuple[Array, ...]:
+    """Wall times of decisions one at a time, in short flights that are there for nothing else.
+
+    Args:
+        policy: It.
+        env: A Gymnasium environment or a ParallelEnv, which has been checked.
+        seed: Of the first of TIMED_STARTS flights.
+
+    Returns:
+        Of each flight the times per vehicle, s, of its first TIMED_STEPS decisions, or to its end.
+    """
+    flights = _episodes(policy, env, TIMED_STARTS, seed, TIMED_STEPS)
+    return tuple({episode.seed: episode.decision_times for episode in flights}.values())
+
+
+def with_times(flights: Iterable[Episode], seed: int, timed: Sequence[Array]) -> Iterator[Episode]:
+    """Flights that were not timed, with the times that `time_decisions` found from the same starts."""
+    for episode in flights:
+        found = timed[episode.seed - seed] if episode.seed - seed < len(timed) else np.zeros(0)
+        found = found[: len(episode.rewards)]
+        times = np.concatenate([found, np.full(len(episode.rewards) - len(found), np.nan)])
+        yield episode._replace(decision_times=times)
+
+
+def _episodes(
+    policy: Policy, env: Any, episodes: int, seed: int, steps: int | None = None
+) -> Iterator[Episode]:
+    """Flights, cut after some steps if a number is given."""
     if isinstance(env, VectorEnv):
-        if env.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP:
-            raise ValueError("autoreset_mode SAME_STEP hides the last state; use NEXT_STEP or DISABLED")
-        return _vector_episodes(policy, env, int(episodes), seed)
+        return row_episodes(policy, env, episodes, seed)
     if is_parallel(env):
-        return _parallel_episodes(policy, env, int(episodes), seed)
-    return _single_episodes(policy, env, int(episodes), seed)
+        return _parallel_episodes(policy, env, episodes, seed, steps)
+    return _single_episodes(policy, env, episodes, seed, steps)
 
 
-def _single_episodes(policy: Policy, env: Any, episodes: int, seed: int) -> Iterator[Episode]:
-    plain, task = env.unwrapped, _flown_task(env)
+def _single_episodes(
+    policy: Policy, env: Any, episodes: int, seed: int, steps: int | None
+) -> Iterator[Episode]:
+    plain, recorder = env.unwrapped, Recorder(_flown_task(env), 1)
     for i in range(episodes):
         observation, _ = env.reset(seed=seed + i)
-        recorder = Recorder(task, [seed + i], plain.reference[None], plain.state[None])
+        recorder.begin([0], [seed + i], Begun(plain.reference[None], plain.state[None]))
         if i == 0:
             _warm_up(policy, observation[None], recorder)
         state, start = None, np.ones(1, dtype=np.bool_)
-        while recorder.live[0]:
+        while recorder.live[0] and recorder.steps[0] != steps:
             actions, state, seconds = decide(policy, observation[None], state, start, recorder)
             seen = observation[None]
             observation, reward, terminated, truncated, said = env.step(actions[0])
@@ -94,7 +138,7 @@ def _single_episodes(policy: Policy, env: Any, episodes: int, seed: int) -> Iter
             told = Said(np.array([reward]), np.array([terminated]), np.array([truncated]), info)
             recorder.add(seen, state, actions, told, seconds, plain.state[None])
             start = np.zeros(1, dtype=np.bool_)
-        yield from recorder.episodes()
+        yield from recorder.episodes([0])
 
 
 def _flown_task(env: Any) -> BaseTask:
@@ -104,77 +148,44 @@ def _flown_task(env: Any) -> BaseTask:
     return replace(task, episode_steps=limit) if 0 < limit < task.episode_steps else task
 
 
-def _vector_episodes(policy: Policy, env: Any, episodes: int, seed: int) -> Iterator[Episode]:
-    """Rounds of as many episodes as there are rows, or teams; a row that is done waits with what it saw last.
-
-    A team's vehicles are consecutive rows.
-    """
-    plain, n = env.unwrapped, env.num_envs
-    teams = getattr(plain, "num_teams", n)
-    size = n // teams
-    for first in range(0, episodes, teams):
-        seeds = [seed + first + t for t in range(teams)]
-        observations, _ = env.reset(seed=seeds)
-        recorder = _vector_recorder(plain, np.repeat(seeds, size).tolist(), size)
-        wanted = size * min(teams, episodes - first)
-        state, start = None, np.ones(n, dtype=np.bool_)
-        while recorder.live[:wanted].any():
-            live = recorder.live[:, None].copy()
-            actions, state, _ = decide(policy, observations, state, start, recorder)
-            seen, *told = env.step(np.where(live, actions, np.float32(0.0)))
-            recorder.add(observations, state, actions, Said(*told), np.nan, _plants(plain, n))
-            observations = np.where(recorder.live[:, None], seen, observations)
-            start = np.zeros(n, dtype=np.bool_)
-        yield from islice(recorder.episodes(), wanted)
-
-
-def _vector_recorder(plain: Any, seeds: Sequence[int], size: int) -> Recorder:
-    """For the episodes that a vector environment has just begun."""
-    if not isinstance(plain.task, TeamTask):
-        return Recorder(plain.task, seeds, plain.reference, plain.state)
-    names = [f"quad_{i % size}" for i in range(len(seeds))]
-    targets = np.repeat(plain.targets, size, axis=0) if plain.task.layout.target else None
-    return Recorder(
-        plain.task, seeds, plain.references, plain.plants, agents=names, targets=targets, team_size=size
-    )
-
-
-def _parallel_episodes(policy: Policy, env: Any, episodes: int, seed: int) -> Iterator[Episode]:
+def _parallel_episodes(
+    policy: Policy, env: Any, episodes: int, seed: int, steps: int | None
+) -> Iterator[Episode]:
     """Agents are rows, in the order of `possible_agents`; one that left keeps its last observation.
 
     Plants, references and the target are what the environment offers as `plants` (n, 16), `references`
     (n, steps, 8) and `target` (steps, 6).
     """
     names = list(env.possible_agents)
+    n, rows = len(names), range(len(names))
+    task = getattr(env, "task", env.unwrapped.task)  # a wrapper that adds to the observation has its own
+    recorder = Recorder(task, n, agents=names, team_size=n)
     for i in range(episodes):
         seen, _ = env.reset(seed=seed + i)
         observations = np.stack([seen[name] for name in names])
-        recorder = _parallel_recorder(env, seed + i, names)
+        recorder.begin(rows, [seed + i] * n, _begun_by_all(env.unwrapped, task, n))
         if i == 0:
             _warm_up(policy, _shown(policy, env, observations), recorder)
         state, first, last = None, True, None
-        while env.agents:
+        while env.agents and recorder.steps.max() != steps:
             shown = _shown(policy, env, observations)
             actions, state, taken = decide(policy, shown, state, np.full(len(shown), first), recorder)
-            seconds = taken / len(names)
+            seconds = taken / n
             actions = actions[0] if is_privileged(policy) else actions
             step = env.step({name: actions[j] for j, name in enumerate(names) if name in env.agents})
             last = _stack_step(names, step[1:], last)
-            plants = _plants(env.unwrapped, len(names))
+            plants = plants_of(env.unwrapped, n)
             recorder.add(observations, state, actions, last, seconds, plants)
-            rows = [step[0].get(name, row) for name, row in zip(names, observations, strict=True)]
-            observations, first = np.stack(rows), False
-        yield from recorder.episodes()
+            kept = [step[0].get(name, row) for name, row in zip(names, observations, strict=True)]
+            observations, first = np.stack(kept), False
+        yield from recorder.episodes(rows)
 
 
-def _parallel_recorder(env: Any, seed: int, names: Sequence[str]) -> Recorder:
-    """For the episodes that a ParallelEnv has just begun."""
-    plain, n = env.unwrapped, len(names)
-    task = getattr(env, "task", plain.task)  # a wrapper that adds to the observation has its own
+def _begun_by_all(plain: Any, task: BaseTask, n: int) -> Begun:
+    """What a ParallelEnv shows of the episodes that it has just begun."""
     tables = np.array(getattr(plain, "references", np.zeros((n, 0, N_REFERENCE))))
     known = isinstance(task, TeamTask) and task.layout.target
-    targets = np.repeat(plain.target[None], n, axis=0) if known else None
-    return Recorder(task, [seed] * n, tables, _plants(plain, n), agents=names, targets=targets, team_size=n)
+    return Begun(tables, plants_of(plain, n), np.repeat(plain.target[None], n, axis=0) if known else None)
 
 
 def _shown(policy: Policy, env: Any, observations: NDArray[Any]) -> NDArray[Any]:
@@ -200,14 +211,6 @@ def _stack_step(names: Sequence[str], parts: Sequence[Mapping[str, Any]], last: 
     first, second, third, last_infos = zip(*told, strict=True)
     info = {key: np.array([entry[key] for entry in last_infos]) for key in last_infos[0]}
     return Said(np.array(first), np.array(second), np.array(third), info)
-
-
-def _plants(plain: Any, n: int) -> Array:
-    """Plants as a team shows them, or as a vector of single vehicles does."""
-    found = getattr(plain, "plants", None)
-    if found is None:
-        found = getattr(plain, "state", None) if hasattr(plain, "num_envs") else np.zeros((n, 0))
-    return np.array(found, dtype=np.float64)
 
 
 def _warm_up(policy: Policy, observations: NDArray[Any], recorder: Recorder) -> None:

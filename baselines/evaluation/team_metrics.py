@@ -20,11 +20,12 @@ from .episode import Episode
 FORMATION_SETTLED = 0.1  # m, distance to the slot below which a vehicle has settled
 FINAL = 1.0  # s, end of a flight over which `formation_final` is taken
 _HEIGHT = 2
+_NOTHING = {column.source: float("nan") for column in COLUMNS.values() if column.has(TEAM) and column.source}
 
 
 def measure_team(episode: Episode) -> dict[str, float]:
     """The columns that only a team's vehicle has; nan where they mean nothing."""
-    found = {column.source: float("nan") for column in COLUMNS.values() if column.has(TEAM) and column.source}
+    found = dict(_NOTHING)
     if not isinstance(episode.task, TeamTask):
         return found
     found["messages"] = float(episode.signals["messages"].mean())

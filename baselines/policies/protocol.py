@@ -53,7 +53,8 @@ class Policy(Protocol):
     """Observations in, actions out, for any number of vehicles at once.
 
     Rows are treated independently and nothing is remembered in attributes: what a policy knows of an episode
-    travels in `state`. `check_policy` tests all of this.
+    travels in `state`. `check_policy` tests all of this. One from outside this suite that keeps to it may say
+    `independent_rows = True`: then it is given the observations of many flights at once.
     """
 
     def predict(

@@ -48,8 +48,8 @@ def run_benchmark(request: BenchmarkRequest) -> Results:
     Networks that the suite trains come first. An interrupted run goes on where it stopped when it is called
     again with the same folder: each finished unit (environment x policy) is stored at once; one whose flights
     are all asked for and were not saved is flown again, and so is one of a policy from outside this suite,
-    whose code may have changed. The folder gets a report.html. Decision times mean something with jobs = 1,
-    or idle cores.
+    whose code may have changed. The folder gets a report.html. Decision times of policies that fly
+    one flight at a time, see `evaluate`, mean something with jobs = 1, or idle cores.
 
     A policy from outside that cannot be made, or breaks off, ends its own units only: a warning says so at
     once, and `Results.failures` in the end.

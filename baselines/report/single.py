@@ -36,12 +36,17 @@ def evaluate(
 ) -> Evaluation:
     """Fly a policy from several starts and measure it.
 
-    Only numbers are kept of each flight, so that memory does not grow with its length. A team gives one
-    record per vehicle and flight; means and intervals are over flights.
+    Flights go side by side in the rows of a vector environment made for them, with the same starts and the
+    same numbers as one at a time (a network's in float32); decisions are then timed in 20 short flights of
+    their own, one at a time. One flight at a time, with each decision timed, fly: policies from outside that
+    do not say `independent_rows = True`, privileged ones, wrapped or foreign environments, those that draw.
+    Only numbers are kept of each flight. A team gives one record per vehicle and flight; means and intervals
+    are over flights.
 
     Args:
         policy: Anything with `predict`, or what `make_policy` takes: a name, `module:factory`, a factory.
-        env: An id, a Gymnasium environment or a ParallelEnv (decisions are timed), or a vector environment.
+        env: An id, a Gymnasium environment or a ParallelEnv, or a vector environment (decisions are not
+            timed).
         episodes: Number of flights, >= 1.
         seed: Flight i starts with the environment seed `seed + i`.
         on_episode: Called with each flight, of a team with that of each vehicle, to save or plot it.

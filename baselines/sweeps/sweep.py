@@ -28,7 +28,7 @@ from .engines import run_units
 from .finished import train_unit
 from .stages import price
 from .suite import Suite
-from .unit_flights import fly_unit
+from .unit_flights import fly_unit, timed_unit
 from .units import Given, Unit, suite_units, training_units
 
 REPORTED = 2  # flights of each unit that are saved for the report where not all are asked for
@@ -118,6 +118,8 @@ class Sweep:
             left.sort(key=lambda unit: (places[unit.env.title], price(unit)))
         if watcher is not None:
             watcher.ready(left)
+        if jobs > 1:  # before others take the cores
+            left = [timed_unit(unit) for unit in left]
         for number, cell in run_units(fly_unit, left, engine, jobs):
             if "failure" in cell:
                 self.failed[number] = cell["failure"]

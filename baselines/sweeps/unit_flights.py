@@ -17,6 +17,8 @@ from quad_envs.tasks import TeamTask
 from ..errors import ResultsError
 from ..evaluation.episode import Episode
 from ..evaluation.evaluate import fly_and_measure
+from ..evaluation.rollout import check_flights, time_decisions
+from ..evaluation.row_forms import has_row_form
 from ..files import write_atomic
 from ..policies.environments import make_env
 from ..policies.registry import from_outside, make_policy, policy_name
@@ -39,14 +41,33 @@ def fly_unit(unit: Unit) -> dict[str, Any]:
         return {"failure": str(error)}
 
 
-def _fly(unit: Unit) -> dict[str, Any]:
-    begin = perf_counter()
+def timed_unit(unit: Unit) -> Unit:
+    """The unit with the times of its decisions, where its flights go side by side; nothing else may run now.
+
+    What is wrong with it shows when it flies.
+    """
+    try:
+        env, policy = _made(unit)
+        check_flights(policy, env, unit.episodes, unit.seed, unit.given.mismatch)
+        timed = time_decisions(policy, env, unit.seed) if has_row_form(policy, env) else None
+    except ValueError:
+        return unit
+    return unit._replace(timed=timed)
+
+
+def _made(unit: Unit) -> tuple[Any, Any]:
+    """Its environment and its policy."""
     env = unit.given.env
     if env is None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # said once before the first unit
             env = make_env(unit.env.id, **unit.env.kwargs)
-    policy = make_policy(unit.source, env, **unit.policy.kwargs)
+    return env, make_policy(unit.source, env, **unit.policy.kwargs)
+
+
+def _fly(unit: Unit) -> dict[str, Any]:
+    begin = perf_counter()
+    env, policy = _made(unit)
     save = None if unit.episode_folder is None else _saver(unit, env)
 
     def on_episode(episode: Episode) -> None:
@@ -55,7 +76,13 @@ def _fly(unit: Unit) -> dict[str, Any]:
                 hear(episode)
 
     found = fly_and_measure(
-        policy, env, unit.episodes, unit.seed, on_episode=on_episode, mismatch=unit.given.mismatch
+        policy,
+        env,
+        unit.episodes,
+        unit.seed,
+        on_episode=on_episode,
+        mismatch=unit.given.mismatch,
+        timed=unit.timed,
     )
     if unit.given.policy is None:
         found = replace(found, policy=policy_name(policy, unit.policy_name))
@@ -80,28 +107,25 @@ def _saver(unit: Unit, env: Any) -> Callable[[Episode], None]:
         team.append(episode)
         if len(team) < episode.team_size:
             return
-        arrays: dict[str, Any] = flight_arrays(team) | _shared_arrays(env)
-        team.clear()
         path = unit.episode_file(episode.seed)
-        if path is None:
-            return
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, **arrays)
-        write_atomic(path, buffer.getvalue())
+        if path is not None:
+            arrays: dict[str, Any] = flight_arrays(team) | _graphs(env)
+            buffer = io.BytesIO()
+            np.savez_compressed(buffer, **arrays)
+            write_atomic(path, buffer.getvalue())
+        team.clear()
 
     return save
 
 
-def _shared_arrays(env: Any) -> dict[str, NDArray[Any]]:
-    """What a team has in common in the flight that just ended: the target's rows r, v, and who hears whom.
+def _graphs(env: Any) -> dict[str, NDArray[Any]]:
+    """Who hears whom in a team, in every flight alike.
 
     `graphs` (M, N, N) are the weights that hold at some step, and `graph_of_step` (T+1,) says which.
     """
-    task = env.unwrapped.task
-    if not isinstance(task, TeamTask):
+    if not isinstance(env.unwrapped.task, TeamTask):
         return {}
-    found = {"graphs": env.unwrapped.graphs.graphs, "graph_of_step": env.unwrapped.graphs.which}
-    return found | ({"target": env.unwrapped.target} if task.layout.target else {})
+    return {"graphs": env.unwrapped.graphs.graphs, "graph_of_step": env.unwrapped.graphs.which}
 
 
 def flight_arrays(team: Sequence[Episode]) -> dict[str, NDArray[Any]]:
@@ -109,10 +133,14 @@ def flight_arrays(team: Sequence[Episode]) -> dict[str, NDArray[Any]]:
 
     Of one vehicle those of its Episode. Of a team the same and its signals, stacked with the vehicles first,
     with `agent` their names and `lengths` the steps that each flew: what lies behind, where one left early,
-    is nan, or zero where there are only whole numbers.
+    is nan, or zero where there are only whole numbers. `target` is one for all of them.
     """
     plain = [
-        {key: value for key, value in episode._asdict().items() if isinstance(value, np.ndarray)}
+        {
+            key: value
+            for key, value in episode._asdict().items()
+            if isinstance(value, np.ndarray) and key != "target"
+        }
         | {key: np.asarray(value) for key, value in episode.signals.items()}
         for episode in team
     ]
@@ -122,7 +150,7 @@ def flight_arrays(team: Sequence[Episode]) -> dict[str, NDArray[Any]]:
     out["agent"] = np.array([episode.agent for episode in team])
     out["lengths"] = np.array([len(episode.rewards) for episode in team])
     out["crashed"] = np.array([episode.crashed for episode in team])
-    return out
+    return out if team[0].target is None else out | {"target": team[0].target}
 
 
 def _stack_ragged(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:

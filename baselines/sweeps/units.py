@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from quad_envs.parameters import Array
+
 from ..evaluation.episode import Episode
 from .suite import EnvChoice, PolicyChoice, Suite, Training, is_for
 
@@ -46,6 +48,7 @@ class Unit(NamedTuple):
     episode_folder: Path | None  # where to save flights
     flights_saved: int = 0  # how many, the first ones
     given: Given = Given()
+    timed: tuple[Array, ...] | None = None  # its decisions, where they were timed before the flights
 
     @property
     def named(self) -> bool:

@@ -99,6 +99,11 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
         return self.action_spaces[agent]
 
     @property
+    def options(self) -> TeamOptions:
+        """The arguments of the environment as a value."""
+        return self._batch.options
+
+    @property
     def task(self) -> TeamTask:
         """What is known of the task before the flight: from this, policies are built."""
         return self._batch.task

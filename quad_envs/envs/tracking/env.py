@@ -126,6 +126,11 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
         self._bind()
 
     @property
+    def options(self) -> TrackingOptions:
+        """The arguments of the environment as a value."""
+        return self._batch.options
+
+    @property
     def task(self) -> Task:
         """What is known of the task before the flight: from this, policies are built."""
         return self._batch.task
