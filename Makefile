@@ -1,6 +1,7 @@
 # make demo   install into .venv, fly every tracking baseline on the helix and write a page of it (needs Python and pip)
 # make test   install the development extras and run ruff, mypy and the tests
 # make slow   the tests that take longer: dissertation tables, other solvers, long flights
+# make wheel  build a wheel into dist/ whose kernels are compiled: no wait at the first use (x86-64)
 # make docs   build the documentation into site/
 # make extras resolve every extra with the pins of constraints.txt, and install nothing
 # make rllib  install RLlib into .venv-rllib (it pins an older gymnasium) and train a formation on a local Ray
@@ -15,7 +16,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 
 EXTRAS := $(shell sed -n '/optional-dependencies/,/^\[project.scripts/s/^\([a-z]*\) = .*/\1/p' pyproject.toml)
 
-.PHONY: demo test slow docs extras rllib test-rllib ray clean
+.PHONY: demo test slow wheel docs extras rllib test-rllib ray clean
 
 demo:
 	@test -e $(VENV)/installed || echo "install: into $(VENV), one to three minutes; then compile, about one, and fly"
@@ -31,6 +32,14 @@ test: $(VENV)/installed-dev
 
 slow: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m slow
+
+wheel: $(VENV)/installed
+	rm -rf build quad_envs/kernels dist/quad_envs-*.whl
+	$(BIN)/quad-envs warm --portable build/portable
+	mkdir -p quad_envs/kernels build/portable/quad-envs
+	cp build/portable/quad-envs/*.nbc quad_envs/kernels || true
+	$(PIP) wheel --no-deps -w dist . ; status=$$?; rm -rf quad_envs/kernels; exit $$status
+	@ls -sh dist/quad_envs-*.whl
 
 docs: $(VENV)/installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict

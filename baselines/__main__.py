@@ -20,6 +20,7 @@ from .cli.options import (
     ReportOptions,
     ReproduceOptions,
     TrainOptions,
+    WarmOptions,
     add_options,
     read_options,
     refuse_unknown,
@@ -99,6 +100,12 @@ def _doctor(options: DoctorOptions) -> int:
     return doctor.examine(options.json)
 
 
+def _warm(options: WarmOptions) -> int:
+    from .cli import warm
+
+    return warm.compile_all(options)
+
+
 COMMANDS: dict[str, Command] = {
     "list": Command(ListOptions, _list),
     "evaluate": Command(EvaluateOptions, _evaluate),
@@ -109,6 +116,7 @@ COMMANDS: dict[str, Command] = {
     "report": Command(ReportOptions, _report),
     "replay": Command(ReplayOptions, _replay),
     "certify": Command(CertifyOptions, _certify),
+    "warm": Command(WarmOptions, _warm),
     "doctor": Command(DoctorOptions, _doctor),
 }
 

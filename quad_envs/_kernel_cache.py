@@ -20,12 +20,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import llvmlite.binding as llvm
 import numba
 import numpy as np
 from numba.core import config, types
 
 from ._kernel_digest import digest
 from ._kernel_file import pack, unpack
+from ._portable import CPU, NEEDED, SHIPPED
 
 PACKAGES = ("quad_envs", "controllers", "baselines")
 _HEADER = hashlib.sha256().digest_size  # bytes before the kernel: its checksum
@@ -33,8 +35,8 @@ _OUTDATED = 7 * 86400.0  # s, after which another version of the same kernel is 
 
 
 def _versions() -> tuple[str, ...]:
-    """Of what compiled kernels hold parts of."""
-    return numba.__version__, np.__version__, str(sys.implementation.cache_tag)
+    """Of what compiled kernels hold parts of; within a minor version of numpy nothing of it changes."""
+    return numba.__version__, *np.__version__.split(".")[:2], str(sys.implementation.cache_tag)
 
 
 def _settings() -> list[str]:
@@ -86,6 +88,18 @@ def folder() -> Path | None:
     return None
 
 
+@cache
+def runs_shipped() -> bool:
+    """Whether kernels that came with a wheel are there and run on this processor.
+
+    Who chose another one (NUMBA_CPU_NAME) wants kernels for that.
+    """
+    if getattr(config, "CPU_NAME", None) is not None or not SHIPPED.is_dir():
+        return False
+    features = llvm.get_host_cpu_features()
+    return all(features.get(name) for name in NEEDED)
+
+
 def _places() -> Iterator[Path]:
     if chosen := getattr(config, "CACHE_DIR", ""):
         yield Path(chosen) / "quad-envs"
@@ -120,11 +134,15 @@ class KernelCache:
         return None if place is None else str(place)
 
     def load_overload(self, signature: Any, target: Any) -> Any:
-        """The compiled form for these argument types; None if there is none that can be read."""
-        name = self._file_name(signature, target.codegen())
-        for place in folders():
+        """The compiled form for these argument types, the user's or the wheel's; None if there is none."""
+        processor = target.codegen().magic_tuple()
+        name = self._file_name(signature, processor)
+        paths = [place / name for place in folders()]
+        if runs_shipped():
+            paths.append(SHIPPED / self._file_name(signature, (processor[0], CPU, "")))
+        for path in paths:
             with contextlib.suppress(FileNotFoundError):
-                compiled = _read(place / name, target)
+                compiled = _read(path, target)
                 if compiled is not None:
                     return compiled
         return None
@@ -136,16 +154,16 @@ class KernelCache:
             return
         with contextlib.suppress(OSError):
             raw = pack(compiled)
-            path = place / self._file_name(signature, compiled.codegen)
+            path = place / self._file_name(signature, compiled.codegen.magic_tuple())
             unfinished = place / f"{path.stem}.{os.getpid()}.tmp"
             unfinished.write_bytes(hashlib.sha256(raw).digest() + raw)
             os.replace(unfinished, path)
             self._sweep(place)
 
-    def _file_name(self, signature: Any, codegen: Any) -> str:
+    def _file_name(self, signature: Any, processor: tuple[str, ...]) -> str:
         if self._digest is None:
             self._digest = digest(self._kernel)[:16]
-        made_for = (_describe_signature(signature), _versions(), _settings(), codegen.magic_tuple())
+        made_for = (_describe_signature(signature), _versions(), _settings(), processor)
         key = hashlib.sha256(repr(made_for).encode()).hexdigest()[:16]
         return f"{self._name}-{self._digest}-{key}.nbc"
 

@@ -107,8 +107,9 @@ def _root(module: str | None) -> str:
 
 
 def _code(code: CodeType, docstring: str | None = None) -> Iterator[str]:
-    """What makes a code object behave as it does."""
-    yield repr((code.co_code, code.co_names, code.co_varnames, code.co_freevars, code.co_flags))
+    """What makes a code object behave as it does. Its flags are left out: profilers change them."""
+    counts = code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount
+    yield repr((code.co_code, code.co_names, code.co_varnames, code.co_freevars, counts))
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
             yield from _code(constant)

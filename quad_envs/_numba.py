@@ -8,9 +8,11 @@ in its plain way, which takes longer and gives the same results, and one warning
 
 from __future__ import annotations
 
+import gc
 import sys
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
@@ -61,29 +63,52 @@ def entry_of(compiled: Function) -> Function:
     return cast(Function, getattr(compiled, "entry", compiled))
 
 
+def kept_in() -> Path | None:
+    """The folder in which compiled kernels are kept; None if they are not."""
+    return None if KernelCache is None else folder()
+
+
+def announce_no_more() -> None:
+    """Let nothing be said of compilation in this process, where another one speaks of it."""
+    _ANNOUNCER.said = True
+
+
 def _kept() -> str:
     """What one compiles and how long it is good for, as the first call finds it."""
     what = "for the first use of this environment or policy, 5 to 20 s of one core each"
-    if KernelCache is None or folder() is None:
+    if kept_in() is None:
         return f"{what}; nothing can be kept, so that each process compiles anew"
     return f"{what}; kept until their code changes"
 
 
 class _Announcer(event.Listener):
-    """Says once per process that kernels are being compiled, since the first call then takes seconds."""
+    """Says once per process that kernels are being compiled, since the first call then takes seconds.
+
+    While one is, Python's collector of cycles rests: it would look for garbage among all that numba has
+    built so far, again and again, which takes a fifth of the time.
+    """
 
     def __init__(self) -> None:
         self.said = False
+        self._depth = 0
+        self._collects = False  # outside
 
     def on_start(self, event: Any) -> None:
         """A kernel was not in the cache: say so, once."""
+        if self._depth == 0:
+            self._collects = gc.isenabled()
+            gc.disable()
+        self._depth += 1
         module = event.data["dispatcher"].py_func.__module__ or ""
         if not self.said and module.split(".")[0] in PACKAGES:
             self.said = True
             print(f"quad_envs: compiling {_kept()}", file=sys.stderr, flush=True)
 
     def on_end(self, event: Any) -> None:
-        """Nothing to say when it ends."""
+        """A kernel is compiled; the one whose compilation asked for it may still be at it."""
+        self._depth -= 1
+        if self._depth == 0 and self._collects:
+            gc.enable()
 
 
 _ANNOUNCER = _Announcer()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -304,7 +305,7 @@ def test_doctor_examines_the_installation(capsys):
     findings = {finding["check"]: finding for finding in json.loads(capsys.readouterr().out)}
     assert set(findings) == {"versions", "packages", "cache", "self-test", "team-test", "extras"}
     assert all(finding["ok"] for finding in findings.values())
-    assert Path(findings["cache"]["detail"]).is_absolute()
+    assert re.match(r"\d+ compiled kernels in /", findings["cache"]["detail"])
 
 
 def test_doctor_names_a_package_of_the_same_name(monkeypatch):

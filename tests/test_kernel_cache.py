@@ -1,5 +1,6 @@
 """Compiled kernels are found again by content; no folder, file or version of numba stops a start."""
 
+import cProfile
 import importlib
 import os
 import subprocess
@@ -133,13 +134,22 @@ def test_options_of_compilation_count_at_every_depth():
         assert once == again != other
 
 
+def test_a_profiler_leaves_a_kernel_valid():
+    compiled = kernel(lambda x: 2.0 * x)
+    before = cache.digest(compiled)
+    with cProfile.Profile():
+        assert compiled(1.5) == compiled(1.5) == 3.0
+    assert cache.digest(compiled) == before
+
+
 def identity(x):
     return x
 
 
 def file_name(signature=(float64,)):
     """Under which a kernel is kept."""
-    return cache.KernelCache(kernel(identity))._file_name(signature, cpu_target.target_context.codegen())
+    processor = cpu_target.target_context.codegen().magic_tuple()
+    return cache.KernelCache(kernel(identity))._file_name(signature, processor)
 
 
 @pytest.mark.parametrize(
@@ -227,6 +237,58 @@ def test_old_versions_of_a_kernel_and_unfinished_files_are_swept_after_a_while(t
     assert recent.exists() and not old.exists() and not unfinished.exists()
 
 
+def shipped_kernel(tmp_path, monkeypatch):
+    """A kernel that came with a wheel, for a user who has compiled nothing; its file, the user's folder."""
+    made, shipped, own = (tmp_path / name for name in ("made", "shipped", "own"))
+    for folder in (made, shipped, own):
+        folder.mkdir()
+    compiled = fresh_kernel(made, monkeypatch)
+    compiled(1.5)
+    processor = (cpu_target.target_context.codegen().magic_tuple()[0], cache.CPU, "")
+    file = shipped / compiled.entry._cache._file_name((float64,), processor)
+    next(made.iterdir()).rename(file)
+    monkeypatch.setattr(cache, "SHIPPED", shipped)
+    monkeypatch.setattr(cache, "runs_shipped", cache.runs_shipped.__wrapped__)
+    monkeypatch.setattr(cache.llvm, "get_host_cpu_features", lambda: dict.fromkeys(cache.NEEDED, True))
+    return fresh_kernel(own, monkeypatch), file, own
+
+
+def test_a_kernel_that_came_with_a_wheel_is_loaded_and_not_compiled(tmp_path, monkeypatch):
+    compiled, _, own = shipped_kernel(tmp_path, monkeypatch)
+    assert compiled(1.5) == 3.0 and sum(compiled.entry.stats.cache_hits.values()) == 1
+    assert not list(own.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "value"),
+    [
+        (cache.llvm, "get_host_cpu_features", lambda: {**dict.fromkeys(cache.NEEDED, True), "avx2": False}),
+        (config, "CPU_NAME", "generic"),
+    ],
+    ids=["older", "chosen"],
+)
+def test_on_another_processor_than_the_wheels_a_kernel_is_compiled(tmp_path, monkeypatch, owner, name, value):
+    compiled, _, own = shipped_kernel(tmp_path, monkeypatch)
+    monkeypatch.setattr(owner, name, value)
+    assert compiled(1.5) == 3.0 and sum(compiled.entry.stats.cache_misses.values()) == 1
+    assert len(list(own.iterdir())) == 1
+
+
+def test_a_cut_file_of_a_wheel_that_cannot_be_deleted_is_compiled_and_kept_elsewhere(tmp_path, monkeypatch):
+    compiled, file, own = shipped_kernel(tmp_path, monkeypatch)
+    file.write_bytes(file.read_bytes()[:-1])
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "unlink", fails_to_write)
+        assert compiled(1.5) == 3.0
+    assert file.exists() and sum(compiled.entry.stats.cache_misses.values()) == 1
+    again = fresh_kernel(own, monkeypatch)
+    assert again(1.5) == 3.0 and sum(again.entry.stats.cache_hits.values()) == 1
+
+
+def fails_to_write(*arguments, **keywords):
+    raise PermissionError("read-only")
+
+
 EVERYTHING = """
 import sys
 from typing import NamedTuple
@@ -279,6 +341,23 @@ def test_kernels_found_again_need_no_compiler_and_others_compile_beside_them(tmp
     assert "compiler loaded: True True" in cold
     assert warm == cold.replace("True True", "False False")
     assert mixed == warm + "3.0\n"
+
+
+def test_two_processes_that_compile_at_once_leave_whole_files(tmp_path):
+    script = tmp_path / "everything.py"
+    script.write_text(EVERYTHING)
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    both = [
+        subprocess.Popen([sys.executable, str(script)], env=environment, stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    said = [process.communicate()[0] for process in both]
+    assert said[0] == said[1] and "Pair(table" in said[0] and "True True" in said[0]
+    assert [path.suffix for path in (tmp_path / "quad-envs").iterdir()] == [".nbc"]
+    third = subprocess.run(
+        [sys.executable, str(script)], env=environment, capture_output=True, text=True, check=True
+    )
+    assert "compiler loaded: False False" in third.stdout
 
 
 def test_a_kernel_that_calls_what_is_not_there_is_compiled_anew(tmp_path, monkeypatch):

@@ -1,7 +1,10 @@
 """What a wheel holds: every file of the packages, by the lists of pyproject.toml."""
 
 import sys
+from fnmatch import fnmatch
 from pathlib import Path
+
+from quad_envs._portable import SHIPPED
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -14,7 +17,7 @@ FILES = [
     path.relative_to(ROOT)
     for package in ("quad_envs", "controllers", "baselines")
     for path in sorted((ROOT / package).rglob("*"))
-    if path.is_file() and "__pycache__" not in path.parts
+    if path.is_file() and "__pycache__" not in path.parts and path.suffix != ".nbc"
 ]
 
 
@@ -33,6 +36,13 @@ def test_every_file_that_is_no_code_is_named_as_data():
         for path in (ROOT / package.replace(".", "/")).glob(pattern)
     }
     assert [path for path in FILES if path.suffix != ".py" and ROOT / path not in data] == []
+
+
+def test_a_wheel_holds_the_kernels_that_make_wheel_compiles():
+    place = SHIPPED.relative_to(ROOT)
+    assert f"cp build/portable/quad-envs/*.nbc {place.as_posix()}" in (ROOT / "Makefile").read_text()
+    file = (place / "a.nbc").relative_to("quad_envs").as_posix()
+    assert any(fnmatch(file, pattern) for pattern in SETUPTOOLS["package-data"]["quad_envs"])
 
 
 def test_the_citation_names_this_version():

@@ -6,7 +6,9 @@ import pytest
 
 from baselines.__main__ import main
 from baselines.policies.registry import TRACKING_POLICIES
-from baselines.sweeps.stages import SweepProgress, compile_for, price, said_left, said_seconds
+from baselines.sweeps.compiling import compile_for
+from baselines.sweeps.progress import said_left, said_seconds
+from baselines.sweeps.stages import SweepProgress, price
 from baselines.sweeps.suite import PolicyChoice
 from baselines.sweeps.suite_files import load_suite
 from baselines.sweeps.sweep import Order, Sweep
@@ -40,8 +42,8 @@ def test_each_row_is_said_with_the_time_left_and_quick_policies_fly_first(suite,
     said = capsys.readouterr()
     lines = [line for line in said.err.splitlines() if " score 0." in line]
     assert [re.search(r"(hover|lqr|lmpc) ", line)[1] for line in lines] == ["hover", "lqr", "lmpc"] * 2
-    assert all(re.search(r"about \d+ s left$", line) for line in lines[:-1])
-    assert re.search(r"took \d+ s$", lines[-1])
+    assert all(re.search(r"about \d+ (s|min) left$", line) for line in lines[:-1])
+    assert re.search(r"took \d+ (s|min)$", lines[-1])
     assert said.err.index("compile: hover, lqr, lmpc; took") < said.err.index(lines[0])
     # The tables keep the order of the suite.
     assert [line.split()[0] for line in said.out.splitlines() if line[:4] in ("lmpc", "hove", "lqr ")] == [
@@ -105,6 +107,6 @@ def test_networks_that_are_trained_are_counted_with_the_time_left(tmp_path, caps
     sweep.go()
     said = capsys.readouterr().err.splitlines()
     assert said[0] == "train: 2 networks"
-    assert re.fullmatch(r"train: 1 of 2 are there; about \d+ s left", said[1])
-    assert re.fullmatch(r"train: 2 of 2 are there; took \d+ s", said[2])
+    assert re.fullmatch(r"train: 1 of 2 are there; about \d+ (s|min) left", said[1])
+    assert re.fullmatch(r"train: 2 of 2 are there; took \d+ (s|min)", said[2])
     assert said[3].startswith("compile: hover; ") and len(said) == 7

@@ -88,7 +88,8 @@ def _cache() -> Finding:
     """Whether compiled kernels can be kept."""
     from numba.core import config
 
-    from quad_envs._kernel_cache import folder
+    from quad_envs._kernel_cache import folder, runs_shipped
+    from quad_envs._portable import SHIPPED
 
     if getattr(config, "DISABLE_JIT", False):
         return Finding("cache", False, "kernels are not compiled: unset NUMBA_DISABLE_JIT")
@@ -98,7 +99,13 @@ def _cache() -> Finding:
     if place is None:
         remedy = "no folder can be written, every process compiles anew; set NUMBA_CACHE_DIR to one that can"
         return Finding("cache", False, remedy)
-    return Finding("cache", True, str(place))
+    kept, shipped = (len(list(files.glob("*.nbc"))) for files in (place, SHIPPED))
+    said = f"{kept} compiled kernels in {place}"
+    if shipped:
+        said += f", {shipped} of the wheel" + ", which do not run on this processor" * (not runs_shipped())
+    elif not kept:
+        said += "; quad-envs warm compiles all of them now"
+    return Finding("cache", True, said)
 
 
 def _self_test() -> Finding:

@@ -165,6 +165,16 @@ class CertifyOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class WarmOptions:
+    """Compile all kernels now, so that nothing has to wait for them later."""
+
+    jobs: Annotated[int | None, "processes; as many as there are cores if not given"] = None
+    portable: Annotated[Path | None, "folder for kernels that run on other processors, too: for a wheel"] = (
+        None
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class DoctorOptions:
     """Look at the installation and fly a moment."""
 

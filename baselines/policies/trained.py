@@ -38,6 +38,11 @@ def _shipped_for() -> dict[tuple[str, str], str]:
     return {(entry["algorithm"], entry["env_id"]): name for name, entry in sorted(said.items())}
 
 
+def shipped_for(env_id: str) -> list[str]:
+    """Names of the shipped policies for a task."""
+    return [name for (_, task), name in _shipped_for().items() if task == env_id]
+
+
 def shipped_name(algorithm: str, env_id: str) -> str:
     """Name of the shipped policy of an algorithm for a task.
 

@@ -12,7 +12,7 @@ from quad_envs.names import unknown_name
 from ..evaluation.amounts import require_jobs
 from ..files import write_atomic
 from ..report.figures import house_style
-from ..sweeps.stages import Progress, said_seconds
+from ..sweeps.progress import Progress, said_seconds
 from . import estimation_claims, estimation_tables, formation_claims, formation_tables, page, target_claims
 from .regulation_claims import REGULATION_CLAIMS
 from .results import Section
