@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -17,6 +18,8 @@ from baselines import evaluate
 from baselines.errors import TrainingError
 from baselines.policies.environments import make_env
 from baselines.policies.network import NetworkPolicy
+from baselines.training.held_out import training_options
+from baselines.training.hyperparameters import hyperparameters, recorded_hyperparameters
 from baselines.training.lagrangian import (
     CostCritic,
     LagrangianBuffer,
@@ -25,7 +28,7 @@ from baselines.training.lagrangian import (
     Probe,
     cost_advantages,
 )
-from baselines.training.learner import RowBuffer, Tanh
+from baselines.training.learner import RowBuffer
 from baselines.training.sb3 import (
     PpoLagrangianOptions,
     PpoOptions,
@@ -45,7 +48,9 @@ from quad_envs.envs.team.vector import TeamVectorEnv
 from quad_envs.envs.tracking.options import TrackingOptions
 from quad_envs.envs.tracking.vector import TrackingVectorEnv
 from quad_envs.registration import TRACKING
+from quad_envs.wrappers import FilterAndRescale
 
+HELIX, SPIRAL = "quad/HelixTracking-v0", "quad/SpiralTracking-v0"
 SHORT = {"reference": "random", "time_limit": 1.0, "preview": 3}
 SMALL = PpoOptions(n_envs=8, n_steps=16, batch_size=64, n_epochs=2, net_arch=(16, 16))
 
@@ -180,6 +185,24 @@ def test_infos_of_rows_where_nothing_ended_cannot_be_written():
     assert infos[0].get("TimeLimit.truncated", False) is False
 
 
+@pytest.mark.parametrize(("algorithm", "env_id"), [("ppo", HELIX), ("ppo", SPIRAL), ("sac", HELIX)])
+def test_a_learner_sees_and_commands_what_the_wrapper_shows_and_takes(algorithm, env_id):
+    options = training_options(env_id, {"preview": 12})
+    flights = make_flights(options, replace(hyperparameters(algorithm, env_id), n_envs=1), [5])
+    wrapper = FilterAndRescale(gym.make(env_id, preview=12))
+    assert flights.encoder.encoding == wrapper.encoder.encoding
+    np.testing.assert_array_equal(flights.reset()[0], wrapper.reset(seed=5)[0])
+    outputs = random_outputs(np.random.default_rng(1), 1)
+    np.testing.assert_array_equal(flights.step(outputs)[0][0], wrapper.step(outputs[0])[0])
+
+
+def test_what_earlier_versions_recorded_keeps_their_range_of_commands():
+    old = {"n_envs": 64, "n_epochs": 5}
+    assert recorded_hyperparameters("ppo", old)["command_range"] == 1.0
+    assert recorded_hyperparameters("ppo", {**old, "command_range": 0.25})["command_range"] == 0.25
+    assert "command_range" not in recorded_hyperparameters("apg", {"n_envs": 64})
+
+
 def test_equal_seeds_draw_equal_starts_and_others_do_not():
     options = TrackingOptions.from_kwargs({})
     first, same, other = (TrainingVecEnv(options, 4, seed).reset() for seed in (3, 3, 4))
@@ -303,8 +326,8 @@ def test_violations_are_measured_without_the_noise_of_training():
     options = replace(SMALL, log_std_init=0.0)
     model = make_ppo(make_flights(task, options, 0), options, 0, lambda: 0.0)
     # A new network hovers without noise, which keeps the rate limit; with noise nothing does.
-    assert Probe(corridor(16, 1)).share(model, 10) < 0.5
-    noisy = corridor(16, 1)
+    assert Probe(make_flights(task, replace(options, n_envs=16), 1)).share(model, 10) < 0.5
+    noisy = make_flights(task, replace(options, n_envs=16), 1)
     features = noisy.reset()
     for _ in range(10):
         features = noisy.step(model.predict(features)[0])[0]
@@ -323,25 +346,6 @@ def test_the_multiplier_rests_while_training_is_free(monkeypatch):
     share[0] = 0.6
     next(generator)
     assert len(seen) == 1
-
-
-def test_the_compiled_tanh_has_the_values_and_gradients_of_torch():
-    x, y = (torch.linspace(-12.0, 12.0, 1001, requires_grad=True) for _ in range(2))
-    weights = torch.linspace(-1.0, 2.0, 1001)
-    ours = Tanh()(x + 0.0)  # in place of what the sum gives
-    (ours * weights).sum().backward()
-    (torch.tanh(y) * weights).sum().backward()
-    # The rational function errs by 4e-7 at most, its slope 1 - y^2 by twice that.
-    torch.testing.assert_close(ours, torch.tanh(y), rtol=0.0, atol=4e-7)
-    torch.testing.assert_close(x.grad, y.grad, rtol=0.0, atol=2e-6)
-    assert ours.abs().max() == 1.0
-
-
-def test_the_compiled_tanh_keeps_what_is_not_finite_and_refuses_a_leaf():
-    odd = torch.tensor([float("nan"), float("inf"), float("-inf")])
-    torch.testing.assert_close(Tanh()(odd), torch.tensor([float("nan"), 1.0, -1.0]), equal_nan=True)
-    with pytest.raises(RuntimeError, match="leaf Variable that requires grad"):
-        Tanh()(torch.zeros(3, requires_grad=True))
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "sac"])
@@ -364,7 +368,7 @@ def test_an_exported_network_decides_as_the_learner_without_noise(algorithm):
     actions, _ = policy.predict(observations)
     assert np.abs(outputs).max() > 0.3
     # The scaling is folded into the first layer: other roundings in float32.
-    np.testing.assert_allclose(actions, hover_actions(outputs, env.task), atol=1e-5)
+    np.testing.assert_allclose(actions, env.encoder.act(outputs), atol=1e-5)
 
 
 @pytest.mark.parametrize(

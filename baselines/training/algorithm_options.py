@@ -85,19 +85,19 @@ class PpoOptions:
     n_envs: int = 512  # flights at once, or vehicles of all teams
     n_steps: int = 32  # of each of them in an update
     batch_size: int = 4096  # samples of a minibatch; made smaller or larger until all of an update are equal
-    n_epochs: int = 5  # passes over the samples of an update
+    n_epochs: int = 4  # passes over the samples of an update
     learning_rate: float = 1e-3  # of Adam, at the beginning
     final_rate: float = 0.05  # share of the learning rate at the end of the budget
     gamma: float = 0.99  # discount per step
     gae_lambda: float = 0.98  # of the advantage estimate
     clip_range: float = 0.2  # of the ratio of probabilities
-    log_std_init: float = -2.0  # log of an action's standard deviation at the start
+    log_std_init: float = -1.0  # log of an action's standard deviation at the start
     ent_coef: float = 0.0  # weight of the entropy bonus
     vf_coef: float = 0.5  # weight of the value function's loss
     max_grad_norm: float = 0.5  # to which gradients are clipped
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers, of policy and critic alike
-    stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for the usual ones
-    command_range: float = 1.0  # largest change of a rotor force, as a share of its force in hover
+    stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for FilterAndRescale's
+    command_range: float = 0.5  # largest change of a rotor force, as a share of its force in hover
     episode_steps: int | None = None  # of a flight in training; None for the task's own
     critic_updates: int = 5  # of the critic alone, where training goes on from a policy
 
@@ -132,8 +132,8 @@ class SacOptions:
     tau: float = 0.01  # by which the target critics follow in a gradient step
     ent_coef: float | str = "auto_0.01"  # weight of the entropy; "auto_0.01" learns it, from 0.01
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers, of policy and critics alike
-    stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for the usual ones
-    command_range: float = 1.0  # largest change of a rotor force, as a share of its force in hover
+    stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for FilterAndRescale's
+    command_range: float = 0.5  # largest change of a rotor force, as a share of its force in hover
     episode_steps: int | None = None  # of a flight in training; None for the task's own
     progress_steps: int = 64  # of each flight between two looks at the policy
 

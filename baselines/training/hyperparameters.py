@@ -23,6 +23,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
+_BEFORE = {"command_range": 1.0}  # what was done before it could be chosen, where that is no default
 _SLIP = 0.75  # likeness from which a name is taken for a slip: many names of learners are alike
 
 
@@ -74,7 +75,8 @@ def recorded_hyperparameters(algorithm: str, values: Mapping[str, Any]) -> dict[
     if algorithm not in ALGORITHMS:
         return dict(values)
     defaults = plain_options(options_of(algorithm)())
-    return defaults | in_names_of_today(values, defaults)
+    before = {name: value for name, value in _BEFORE.items() if name in defaults}
+    return defaults | before | in_names_of_today(values, defaults)
 
 
 def _unknown(algorithm: str, name: str, known: Collection[str]) -> str:

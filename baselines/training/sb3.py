@@ -20,6 +20,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from quad_envs.encoding import Encoding
 from quad_envs.envs.team.options import TeamOptions
+from quad_envs.envs.tracking.options import TrackingOptions
+from quad_envs.wrappers.encoded_space import stages_of
 
 from ..errors import TrainingError
 from ..policies.network import Network
@@ -125,7 +127,10 @@ def make_flights(
             no rotor commands.
     """
     size = task_options.vehicles if isinstance(task_options, TeamOptions) else 1
-    encoding = Encoding(training_features(task_options, options.stages), options.command_range)
+    stages = options.stages
+    if stages is None and isinstance(task_options, TrackingOptions):
+        stages = stages_of(task_options.task.layout.preview)
+    encoding = Encoding(training_features(task_options, stages), options.command_range)
     if start is not None:
         encoding = start.encoding
     n = max(1, options.n_envs // size)

@@ -52,6 +52,11 @@ def encoder_of(plain: dict[str, Any]) -> Encoder:
     return Encoder(Encoding.from_plain(plain), Task(limits=limits, layout=TrackingLayout(**plain["layout"])))
 
 
+def stages_of(preview: int) -> tuple[int, ...]:
+    """Those of `STAGES` that a preview has."""
+    return tuple(stage for stage in STAGES if stage <= preview)
+
+
 def make_encoder(env: Any, stages: tuple[int, ...] | None, command_range: float) -> Encoder:
     """The encoder of a wrapper.
 
@@ -71,7 +76,7 @@ def make_encoder(env: Any, stages: tuple[int, ...] | None, command_range: float)
         )
     there = range(task.layout.preview + 1)
     if stages is None:
-        stages = tuple(stage for stage in STAGES if stage in there)
+        stages = stages_of(task.layout.preview)
     elif not stages or not set(stages) <= set(there):
         raise ValueError(
             f"stages must be some of 0 to {task.layout.preview}, the preview, got {shown(stages)}"
