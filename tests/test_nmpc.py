@@ -7,7 +7,7 @@ import pytest
 from flights import DT, HOVER, TASK, at_rest, decide_once, fly, helix, jumps, plan_of, window
 
 from controllers import ExactNmpc
-from controllers.mpc.exact import gauss_newton_weight, rates_residual, velocity_residual
+from controllers.mpc.residual import gauss_newton_weight, rates_residual, velocity_residual
 from controllers.qp.riccati import dare
 from quad_envs.parameters import Limits
 from quad_envs.rotations import rotation_body_from_inertial
@@ -135,8 +135,11 @@ def test_guess_survives_a_wrapped_yaw(frame):
     np.testing.assert_allclose(a.command, b.command, atol=1e-9)
 
 
-def ipopt_plan(x_0, rows, last, task, horizon, velocity_error, terminal):
-    """The same nonlinear program, written for CasADi from the chapter and solved by IPOPT: inputs, (N, 4)."""
+def ipopt_plan(x_0, rows, last, task, horizon, velocity_error, terminal, stage=lambda cost: cost):
+    """The same nonlinear program, written for CasADi from the chapter and solved by IPOPT: inputs, (N, 4).
+
+    `stage` is what a plan pays for the cost |e(x_{i+1})|^2 + |u_i|^2 of a stage.
+    """
     import casadi as ca
 
     params, limits = task.params, task.limits
@@ -175,8 +178,7 @@ def ipopt_plan(x_0, rows, last, task, horizon, velocity_error, terminal):
     u = ca.SX.sym("u", 4, horizon)
     x, cost, before, moves = ca.DM(x_0), 0, ca.DM(last - HOVER), []
     for i in range(horizon):
-        e, F = error(x, rows[i]), u[:, i] + HOVER
-        cost += ca.dot(e, e) + ca.dot(u[:, i], u[:, i])
+        F = u[:, i] + HOVER
         moves.append(u[:, i] - before)
         before = u[:, i]
         k1 = f(x, F)
@@ -184,8 +186,9 @@ def ipopt_plan(x_0, rows, last, task, horizon, velocity_error, terminal):
         k3 = f(x + DT / 2 * k2, F)
         k4 = f(x + DT * k3, F)
         x = x + DT / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    e = error(x, rows[horizon])
-    cost += e.T @ ca.DM(terminal) @ e
+        e = error(x, rows[i + 1])
+        W = ca.DM(terminal) if i == horizon - 1 else ca.DM.eye(12)
+        cost += stage(e.T @ W @ e + ca.dot(u[:, i], u[:, i]))
     problem = {"x": ca.vec(u), "f": cost, "g": ca.vertcat(*moves)}
     quiet = {"ipopt.print_level": 0, "print_time": False, "ipopt.tol": 1e-11}
     solver = ca.nlpsol("solver", "ipopt", problem, quiet)

@@ -55,6 +55,12 @@ TRACKING_POLICIES: dict[str, PolicyEntry] = {
     "nmpc": PolicyEntry(
         "controllers", "ExactNmpc", "MPC on the exact model: real-time iteration, or SQP", decision_ms=0.2
     ),
+    "score-nmpc": PolicyEntry(
+        "controllers.mpc.exact",
+        "ScoreNmpc",
+        "the same, planning for the score instead of the quadratic cost",
+        decision_ms=0.2,
+    ),
     "sdre": PolicyEntry(
         "controllers", "Sdre", "state-dependent Riccati feedback, without preview", decision_ms=0.08
     ),

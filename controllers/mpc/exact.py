@@ -7,7 +7,7 @@ out the second derivatives of e.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 from quad_envs._numba import entry_of, kernel
 from quad_envs.parameters import N_INPUT, N_STATE, Array
@@ -16,7 +16,7 @@ from quad_envs.tasks import Task
 
 from ..controller import first_non_finite
 from ..fallback import RELAXED
-from ..model import RK4_SCRATCH, rk4_sensitivities, rotated_derivatives
+from ..model import RK4_SCRATCH, rk4_sensitivities
 from ..packed import unpacker
 from ..qp.linalg import copy, fill
 from ..qp.ocp import IntArray
@@ -32,7 +32,18 @@ from .kernels import (
     solve_within_model,
 )
 from .mpc import Mpc, Problem
-from .options import EXACT_TILT, NmpcOptions, chosen
+from .options import EXACT_TILT, NmpcOptions, ScoreNmpcOptions, chosen
+from .residual import gauss_newton_weight, stage_residual
+from .score import (
+    ALLOWED,
+    COST_FLOOR,
+    begin_weighing,
+    loses_more,
+    restore_guess,
+    set_floor,
+    stage_loss,
+    weigh_stages,
+)
 
 CONVERGED = 1e-6  # N, largest change of an input in the last pass
 _PITCH_LIMIT = 1.4  # rad, of the states at which the model is linearised
@@ -40,7 +51,7 @@ _RK4 = RK4_SCRATCH * (N_STATE + N_INPUT)
 
 
 @kernel
-def load_guess(plan: Array, kept: Array, heading: bool, s: Scratch) -> None:
+def load_guess(plan: Array, kept: Array, heading: bool, s: Scratch) -> bool:
     """The previous solution shifted by one sample, or the present state held.
 
     Nothing depends on where the vehicle is and how it is headed, so the guess moves with its own first state.
@@ -50,6 +61,9 @@ def load_guess(plan: Array, kept: Array, heading: bool, s: Scratch) -> None:
         kept: Whether a guess is held, then its states, (1 + 12 (N+1),).
         heading: Whether the frame of the problem turned with the vehicle.
         s: x_0 and offset are read; X and F are the results.
+
+    Returns:
+        Whether there was a previous solution.
     """
     N = s.F.shape[0]
     held = kept[0] > 0.0 and plan[0] > 0.0
@@ -75,6 +89,14 @@ def load_guess(plan: Array, kept: Array, heading: bool, s: Scratch) -> None:
         for a in range(N_INPUT):
             s.F[i, a] = plan[1 + N_INPUT * min(i + 1, N - 1) + a] if held else s.offset[a]
     copy_vector(s.x_0, s.X[0])
+    return bool(held)
+
+
+@kernel
+def begin_passes(floor: float, plan: Array, kept: Array, heading: bool, s: Scratch) -> None:
+    """The guess of the first pass; only about a previous solution are there weights of the score."""
+    held = load_guess(plan, kept, heading, s)
+    begin_weighing(floor if held else COST_FLOOR, s)
 
 
 @kernel
@@ -99,99 +121,31 @@ def linearise_model(data: MpcData, s: Scratch) -> None:
 
 
 @kernel
-def velocity_residual(Theta: Array, v_ref: Array, D: Array) -> tuple[float, float, float]:
-    """R_BI(Theta) v_ref, and its derivative by Theta.
-
-    Args:
-        Theta: Roll, pitch, yaw, (3,).
-        v_ref: In the axes from which yaw counts, (3,).
-        D: Result, (3, 3).
-    """
-    sf, cf = sincos(Theta[0])
-    st, ct = sincos(Theta[1])
-    ss, cs = sincos(Theta[2])
-    G = rotated_derivatives(sf, cf, st, ct, ss, cs, v_ref[0], v_ref[1], v_ref[2])
-    for a in range(3):
-        D[0, a], D[1, a], D[2, a] = G[a], G[3 + a], G[6 + a]
-    forward = cs * v_ref[0] + ss * v_ref[1]
-    side = cs * v_ref[1] - ss * v_ref[0]
-    down = st * forward + ct * v_ref[2]
-    return ct * forward - st * v_ref[2], sf * down + cf * side, cf * down - sf * side
-
-
-@kernel
-def rates_residual(Theta: Array, psi_dot: float, D: Array) -> tuple[float, float, float]:
-    """Omega_ref = E(Theta) [0, 0, psi_dot], and its derivative by Theta.
-
-    Args:
-        Theta: Roll, pitch, yaw, (3,).
-        psi_dot: Rate of the heading, rad/s.
-        D: Result, (3, 3).
-    """
-    sf, cf = sincos(Theta[0])
-    st, ct = sincos(Theta[1])
-    D[0, 0], D[1, 0], D[2, 0] = 0.0, psi_dot * cf * ct, -psi_dot * sf * ct
-    D[0, 1], D[1, 1], D[2, 1] = -psi_dot * ct, -psi_dot * sf * st, -psi_dot * cf * st
-    D[0, 2], D[1, 2], D[2, 2] = 0.0, 0.0, 0.0
-    return -psi_dot * st, psi_dot * sf * ct, psi_dot * cf * ct
-
-
-@kernel
-def gauss_newton_weight(Q: Array, D: Array, out: Array) -> None:
-    """E'Q E for E = I but for the blocks (V_B, Theta) and (Omega, Theta) = -D; derivative of the residual.
-
-    Args:
-        Q: (12, 12), symmetric.
-        D: (6, 3), or (3, 3) of V_B alone.
-        out: Result, (12, 12).
-    """
-    n = N_STATE
-    copy(Q, out)
-    for i in range(n):
-        for a in range(3):
-            for k in range(D.shape[0]):
-                out[i, 6 + a] -= Q[i, 3 + k if k < 3 else 6 + k] * D[k, a]
-    for a in range(3):
-        for j in range(n):
-            total = 0.0
-            for k in range(D.shape[0]):
-                total += D[k, a] * out[3 + k if k < 3 else 6 + k, j]
-            out[6 + a, j] -= total
-
-
-@kernel
 def linearise_cost(inertial: bool, data: MpcData, s: Scratch) -> None:
-    """Stage weights Q_i = E_i'Q E_i and references X_i - E_i^-1 e(X_i) about the guess.
+    """Stage weights Q_i = E_i'Q E_i and references X_i - E_i^-1 e(X_i) about the guess, and its stage costs.
 
-    The residual is that of the reward, e = [p - p_ref; V_B - R_BI(Theta) v_ref; Theta - Theta_ref; Omega -
-    E(Theta) [0, 0, psi_dot] with the yaw error wrapped; without `inertial`, v_ref is not turned.
+    The residual is that of the reward, see `stage_residual`; without `inertial`, v_ref is not turned.
     """
     N = s.F.shape[0]
-    D = s.square[9, 2:8, :3]
+    D, e, u = s.square[9, 2:8, :3], s.square[9, 8], s.square[9, 9, :N_INPUT]
     fill(D, 0.0)
     for i in range(N + 1):
         r, X = s.target[i], s.X[i]
-        copy_vector(s.r[i], r)
-        if data.heading:
-            r[8] = X[8] - wrap_angle_scalar(X[8] - r[8])
-        if inertial:
-            v = velocity_residual(X[6:9], s.r[i, 3:6], D)
-            for k in range(3):
-                r[3 + k] = v[k]
-                for a in range(3):
-                    r[3 + k] -= D[k, a] * (X[6 + a] - r[6 + a])
-        blocks = D[:3]
-        if s.r[i, 11] != 0.0:  # psi_dot: the heading turns
-            blocks = D
-            rates = rates_residual(X[6:9], s.r[i, 11], D[3:])
-            for k in range(3):
-                r[9 + k] = rates[k]
-                for a in range(3):
-                    r[9 + k] -= D[3 + k, a] * (X[6 + a] - r[6 + a])
+        rows = stage_residual(inertial, data.heading, X, s.r[i], e, D)
+        blocks = D[:rows]
+        for a in range(N_STATE):
+            r[a] = X[a] - e[a]
+        for k in range(rows):
+            for a in range(3):
+                r[3 + k if k < 3 else 6 + k] -= D[k, a] * e[6 + a]
         if i < N:
             gauss_newton_weight(data.Q[0], blocks, s.Q[i])
         else:
             gauss_newton_weight(data.P, blocks, s.P)
+        if i > 0:
+            for a in range(N_INPUT):
+                u[a] = s.F[i - 1, a] - s.offset[a]
+            s.loss[i - 1] = stage_loss(e, u, data)
 
 
 @kernel
@@ -205,6 +159,29 @@ def take_step(u: Array, x: Array, s: Scratch) -> float:
             s.F[i, a] = F
     copy(x, s.X)
     return change
+
+
+@kernel
+def accept_plan(
+    number: int, passes: int, floor: float, inertial: bool, data: MpcData, s: Scratch, ws: Workspace
+) -> bool:
+    """Take the plan of pass `number` from ws, unless the step control refuses it.
+
+    A plan that is predicted to lose more of the score than its guess shows that the tangent does not hold so
+    far. In the first pass the guess belongs to another state, and the next pass has the weights of the cost;
+    later on the plan of the pass before is the result.
+
+    Returns:
+        Whether it was the last pass.
+    """
+    if loses_more(ALLOWED if number == 0 else 0.0, inertial, data, s, ws.x, ws.u):
+        if number == 0:
+            set_floor(COST_FLOOR, s)
+            return False
+        restore_guess(s, ws.u, ws.x)
+        return True
+    set_floor(floor, s)
+    return bool(take_step(ws.u, ws.x, s) < CONVERGED or number >= passes - 1)
 
 
 @kernel
@@ -222,6 +199,7 @@ class _Call(NamedTuple):
 
     passes: int
     inertial: bool  # as of `linearise_cost`
+    floor: float  # of the stage weights, see `score.weigh_stages`
     keep_from: int  # where the guess begins in memory
     data: MpcData
     buffer: Annotated[Array, "numbers"]
@@ -245,7 +223,7 @@ def _decide_rows(
     words: IntArray,
 ) -> int:
     """One decision per row; -1, or the code of the first argument that is not finite."""
-    passes, inertial, keep_from, data, buffer, ws = _unpack(words)
+    passes, inertial, floor, keep_from, data, buffer, ws = _unpack(words)
     N = ws.u.shape[0]
     bad = first_non_finite(plants, windows, lasts, disturbances, memories, N + 1)
     if bad >= 0:
@@ -254,15 +232,16 @@ def _decide_rows(
     s = carve(buffer, N, N, H, K, N)
     for j in range(plants.shape[0]):
         begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
-        load_guess(memories[j], memories[j, keep_from:], data.heading, s)
+        begin_passes(floor, memories[j], memories[j, keep_from:], data.heading, s)
         worst, iterations = 0, 0
-        for _ in range(passes):
+        for number in range(1 + passes):  # one more where the step control refuses the first
             linearise_model(data, s)
             linearise_cost(inertial, data, s)
+            weigh_stages(data, s)
             has_plan = memories[j, 0] > 0.0
             level, count = solve_within_model(s.A, s.B, s.Q, s.P, False, s.target, has_plan, data, s, ws)
             worst, iterations = max(worst, level), iterations + count
-            if level > RELAXED or take_step(ws.u, ws.x, s) < CONVERGED:
+            if level > RELAXED or accept_plan(number, passes, floor, inertial, data, s, ws):
                 break
         end_row(worst, plants[j], lasts[j], disturbances[j], memories[j], data, s, ws.u, commands[j], kept[j])
         keep_guess(worst <= RELAXED, s.X, kept[j, keep_from:])
@@ -284,29 +263,44 @@ class ExactNmpc(Mpc):
         ValueError: If an option is not allowed.
     """
 
-    options_type = NmpcOptions
+    options_type: ClassVar[type[NmpcOptions]] = NmpcOptions
     options: NmpcOptions
     _kernel = staticmethod(entry_of(_decide_rows))
 
     def __init__(self, task: Task, options: NmpcOptions | None = None, **changes: Any) -> None:
-        options = chosen(NmpcOptions, options, changes)
+        options = chosen(self.options_type, options, changes)
         super().__init__(task, options, "heading", many_pairs=True, guess=True)
         self._data = self._data._replace(model_tilt=EXACT_TILT)
         self.passes = int(options.passes)
         self._inertial = options.velocity_error == "inertial"
+        self._floor = COST_FLOOR
+        if options.objective == "score":
+            self._floor = float(options.floor)
+            if self._data.own_rows > 0:  # a plan that flies to its limits has to know how late the rotors are
+                self._data = self._data._replace(lag=1.0 / task.params.rotor_rate)
 
     def _call(self, buffer: Array, ws: Workspace) -> _Call:
-        return _Call(self.passes, self._inertial, self._keep_from, self._data, buffer, ws)
+        return _Call(self.passes, self._inertial, self._floor, self._keep_from, self._data, buffer, ws)
 
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
         if number == 0:
-            load_guess(memory, memory[self._keep_from :], self._data.heading, s)
+            begin_passes(self._floor, memory, memory[self._keep_from :], self._data.heading, s)
         linearise_model(self._data, s)
         linearise_cost(self._inertial, self._data, s)
+        weigh_stages(self._data, s)
         return Problem(s.A, s.B, s.Q, s.P, False, s.target)
 
     def _accept(self, number: int, s: Scratch, ws: Workspace) -> bool:
-        return take_step(ws.u, ws.x, s) < CONVERGED or number == self.passes - 1
+        return accept_plan(number, self.passes, self._floor, self._inertial, self._data, s, ws)
 
     def _keep(self, level: int, kept: Array, s: Scratch) -> None:
         keep_guess(level <= RELAXED, s.X, kept[self._keep_from :])
+
+
+class ScoreNmpc(ExactNmpc):
+    """`ExactNmpc` with objective="score": it plans for the reward instead of the quadratic cost.
+
+    Arguments and errors are those of `ExactNmpc`, its options `ScoreNmpcOptions`.
+    """
+
+    options_type: ClassVar[type[NmpcOptions]] = ScoreNmpcOptions

@@ -96,6 +96,8 @@ class Scratch(NamedTuple):
     X: Array  # (M+1, 12), guess of the states
     F: Array  # (M, 4), and of the rotor forces
     points: Array  # (1 or N, 12), states at which the pairs were taken; hover: zeros
+    loss: Array  # (M,), stage costs l(x_{i+1}, u_i) of the guess
+    weighing: Array  # (2,), of the stages in the next pass, entries as in `score`
 
 
 def buffer_size(N: int, pairs: int, H: int, K: int, M: int) -> int:
@@ -103,7 +105,7 @@ def buffer_size(N: int, pairs: int, H: int, K: int, M: int) -> int:
     n, m = N_STATE, N_INPUT
     vectors = 2 * n + 4 * m + 2 * N_DISTURBANCE + ESTIMATOR_SCRATCH
     stages = n * (2 * N + 1) + pairs * n * (n + m) + n * H + 3 * K
-    guess = M * n * n + 2 * n * (M + 1) + m * M
+    guess = M * n * n + 2 * n * (M + 1) + m * M + M + 2
     return vectors + N + stages + (2 + DARE_SCRATCH) * n * n + guess + pairs * n
 
 
@@ -143,13 +145,17 @@ def carve(buffer: Array, N: int, pairs: int, H: int, K: int, M: int) -> Scratch:
     X = take(buffer, i, M + 1, n)
     i += X.size
     F = take(buffer, i, M, m)
-    points = take(buffer, i + F.size, pairs, n)
+    i += F.size
+    points = take(buffer, i, pairs, n)
+    i += points.size
+    loss = take(buffer, i, 1, M)[0]
+    weighing = take(buffer, i + M, 1, 2)[0]
     o = 2 * n + 4 * m
     return Scratch(
         v[:n], v[n : 2 * n], v[2 * n : 2 * n + m], v[2 * n + m : 2 * n + 2 * m],
         v[2 * n + 2 * m : 2 * n + 3 * m], v[2 * n + 3 * m : o], v[o : o + e], v[o + e : o + 2 * e],
         r, c, A, B, normals, rows[0], rows[1], rows[2], square[0], square[1], square[2:], v[o + 2 * e :],
-        working, Q, target, X, F, points,
+        working, Q, target, X, F, points, loss, weighing,
     )  # fmt: skip
 
 

@@ -26,6 +26,7 @@ VelocityReference = Literal["heading", "attitude"]
 LevelReference = Literal["level", "heading", "attitude"]
 PresentReference = Literal["present", "heading", "attitude"]
 VelocityAxes = Literal["level", "present", "heading", "attitude"]
+Objective = Literal["cost", "score"]
 VelocityError = Literal["inertial", "body"]
 TerminalWeight = Literal["hover", "sdre"]
 PLAN_TILT = 0.8  # rad, of models linear in the attitude
@@ -240,12 +241,35 @@ class NmpcOptions(MpcOptions):
         # V_B - v_ref, v_ref turned by the present heading (frame "heading") or not (frame "hover")
     )
 
+    objective: Objective = (
+        "cost"  # what a plan minimises: the sum of the stage costs l, or what the score loses by them,
+        # l / (1 + l) of each stage, by weights 1 / (1 + l)^2 at the guess
+    )
+    floor: float = (
+        0.03  # least weight of a stage over the largest one with objective="score", in (0, 1]: less score and
+        # less cost the higher; 1 is the cost
+    )
+
     usual_tilt: ClassVar[float] = EXACT_TILT
 
     def __post_init__(self) -> None:
         require_whole("passes", self.passes, 1, MOST_PASSES)
+        require_choice("objective", self.objective, Objective)
+        if not 0.0 < self.floor <= 1.0:
+            raise ValueError(
+                f"floor must lie in (0, 1], got {shown(self.floor)}; 1 weighs all stages alike, which is the "
+                "quadratic cost"
+            )
         require_choice("velocity_error", self.velocity_error, VelocityError)
         MpcOptions.__post_init__(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScoreNmpcOptions(NmpcOptions):
+    """What `ScoreNmpc` lets choose."""
+
+    objective: Objective = "score"  # what a plan minimises, as of `NmpcOptions`
+    margin: float = 0.022  # as of `MpcOptions`; at 0.02, one start in forty exceeds a tilt by 0.002 rad
 
 
 _Options = TypeVar("_Options", bound="DataclassInstance")
