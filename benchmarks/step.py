@@ -29,6 +29,34 @@ from baselines.evaluation.table import format_table  # noqa: E402
 _ID = "quad/HelixTracking-v0"
 _STEPS = 1000  # control steps of a single environment in one call
 _DT = 0.05  # s
+_EPISODE = 201  # control steps of an episode and its reset
+_ROWS = 1024  # flights with which options are measured
+_LIMITS: dict[str, Any] = {
+    "kappa": 0.3125,
+    "rate_limit": 5.0,
+    "tilt_limit": 0.35,
+    "velocity_limit": 1.8,
+    "position_limit": ((-9.0, -9.0, -40.0), (9.0, 9.0, 40.0)),
+}
+_NOISY: dict[str, Any] = {"disturbance": "gusts", "sensor_noise": 0.01, "randomize": 0.1}
+# What can be chosen about a task, and costs time.
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "nothing": {},
+    "random reference": {"env_id": "quad/RandomTracking-v0"},
+    "steady wind": {"disturbance": (0.1, 0.0, 0.0), "reveal_disturbance": True},
+    "gusts": {"disturbance": "gusts"},
+    "sensor noise": {"sensor_noise": 0.01},
+    "random vehicles": {"randomize": 0.1},
+    "all limits": _LIMITS,
+    "reset in the same step": {"autoreset_mode": gym.vector.AutoresetMode.SAME_STEP},
+    "everything": {
+        "env_id": "quad/RandomTracking-v0",
+        "reveal_disturbance": True,
+        **_LIMITS,
+        **_NOISY,
+        "kappa": 0.5,
+    },
+}
 
 
 def _single(substeps: int) -> Callable[[], object]:
@@ -51,23 +79,24 @@ def _bare(substeps: int) -> Callable[[], object]:
         _ID, substeps=substeps, time_limit=1e6 * _DT, preview=25, reference="setpoint"
     ).unwrapped
     env.reset(seed=0)
-    batch = env._batch
-    action, out = np.zeros((1, 4), dtype=np.float32), np.empty((1, env.task.layout.size), dtype=np.float32)
+    batch, told = env._batch, env._batch.fresh_scores()
+    action, out = np.zeros(4, dtype=np.float32), np.empty(env.task.layout.size, dtype=np.float32)
+    start = np.zeros((1, 16))
+    start[0, 12:] = env.task.hover_force
 
     def call() -> None:
         for _ in range(_STEPS):
-            batch.step(action, out)
-        batch.rows[0, :12] = 0.0
-        batch.rows[0, 43] = 0.0
+            batch.step(action, out, told)
+        batch.begin(np.zeros(1, dtype=np.int64), [env.np_random], out, told, start)
 
     return call
 
 
-def _vector(n: int, substeps: int) -> tuple[Callable[[], object], int]:
-    env = gym.make_vec(_ID, num_envs=n, substeps=substeps)
+def _vector(n: int, env_id: str = _ID, **options: Any) -> tuple[Callable[[], object], int]:
+    env = gym.make_vec(env_id, num_envs=n, **options)
     env.reset(seed=0)
     actions = np.zeros((n, 4), dtype=np.float32)
-    steps = max(1, 4096 // n)
+    steps = max(1, 4096 // n) if not options and env_id == _ID else _EPISODE  # with its share of resets
 
     def call() -> None:
         for _ in range(steps):
@@ -128,8 +157,11 @@ def measure(seconds: float) -> dict[str, dict[str, float]]:
     candidates["bare step, 5 substeps"] = _bare(5), _STEPS
     physics["bare step, 5 substeps"] = 5, _DT
     for n in (8, 64, 1024, 4096):
-        candidates[f"vector of {n}, 5 substeps"] = _vector(n, 5)
+        candidates[f"vector of {n}, 5 substeps"] = _vector(n)
         physics[f"vector of {n}, 5 substeps"] = 5, _DT
+    for name, options in _OPTIONS.items():
+        candidates[f"{_ROWS} with {name}"] = _vector(_ROWS, **{"env_id": _ID, "substeps": 5, **options})
+        physics[f"{_ROWS} with {name}"] = 5, _DT
     if importlib.util.find_spec("l2f"):
         candidates["l2f: one, step + observe"] = _l2f_single(), _STEPS
         candidates["l2f: vector of 1024"] = _l2f_vector(1024)
@@ -149,6 +181,10 @@ def ratios(found: dict[str, dict[str, float]]) -> dict[str, float]:
     """The comparisons that docs/results/speed.md quotes."""
     rate = {name: row["control steps/s"] for name, row in found.items()}
     out = {"bare step / one env": rate["bare step, 5 substeps"] / rate["one env, 5 substeps"]}
+    for name in _OPTIONS:
+        out[f"{_ROWS} with {name} / with nothing"] = (
+            rate[f"{_ROWS} with {name}"] / rate[f"{_ROWS} with nothing"]
+        )
     for name in ("l2f: one, step + observe", "l2f: vector of 1024"):
         if name in rate:
             ours = "one env, 5 substeps" if "one" in name else "vector of 1024, 5 substeps"

@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from quad_envs._numba import kernel
-from quad_envs.dynamics import SCRATCH_ROWS, advance, load_vehicle, rotor_shares, store_vehicle
+from quad_envs.dynamics import arrive, disturbed_substep, place_vehicle, rotor_shares, set_out
+from quad_envs.lanes import AIR_FIRST, AIR_LAST, AIR_MIDDLE, COMMAND, FINITE, LANES, N_FLIGHT, PLANT
 from quad_envs.parameters import (
     GRAVITY,
     HOVER_FORCE,
@@ -26,8 +29,6 @@ from quad_envs.parameters import (
 )
 from quad_envs.rotations import sincos
 
-from .qp.ocp import IntArray
-
 N_DISTURBANCE = 6
 PLANT_SIZE = 16
 ESTIMATOR_GAIN = 0.5  # per sample: less is too slow for the dissertation's torque pulse, more passes noise on
@@ -35,9 +36,7 @@ ESTIMATOR_SIZE = 1 + 2 * N_DISTURBANCE + PLANT_SIZE + N_INPUT  # see `update_est
 _PLANT = 1 + 2 * N_DISTURBANCE
 _COMMAND = _PLANT + PLANT_SIZE
 _SUBSTEPS = 2  # of the prediction: 3e-5 from the limit
-_ROWS = 2 * _SUBSTEPS + 1  # of the disturbance table that the prediction reads
-_TABLE = PLANT_SIZE + N_DISTURBANCE
-ESTIMATOR_SCRATCH = _TABLE + _ROWS * N_DISTURBANCE + SCRATCH_ROWS
+ESTIMATOR_SCRATCH = PLANT_SIZE + N_DISTURBANCE + N_FLIGHT
 _TORQUE_SHARE = 0.25  # of L m g / 2, the roll torque available in hover, that an estimate may reach
 _FORCE_SHARE = 0.5  # of the weight, likewise
 _SMALLEST_LIFT = 0.1  # of the weight, that the thrust carries when a force lifts the vehicle
@@ -115,7 +114,6 @@ def update_estimate(
     force_max: Array,
     estimate: Array,
     scratch: Array,
-    which: IntArray,
 ) -> None:
     """Correct the estimate by what a one-step prediction of the full model, with rotor lag, did not explain.
 
@@ -134,25 +132,29 @@ def update_estimate(
         force_max: Largest force of each rotor, (4,), N.
         estimate: Result, (6,).
         scratch: Overwritten, (ESTIMATOR_SCRATCH,).
-        which: Zeros, (1,).
     """
     for i in range(N_DISTURBANCE):
         estimate[i] = memory[1 + i]
     if memory[0] == 0.0:
         return
-    predicted, correction, rest = scratch[:PLANT_SIZE], scratch[PLANT_SIZE:_TABLE], scratch[_TABLE:]
-    table, w = (
-        rest[: _ROWS * N_DISTURBANCE].reshape(1, 1, _ROWS, N_DISTURBANCE),
-        rest[_ROWS * N_DISTURBANCE :],
-    )
+    predicted, w = scratch[:PLANT_SIZE], scratch[PLANT_SIZE + N_DISTURBANCE :]
+    correction = scratch[PLANT_SIZE : PLANT_SIZE + N_DISTURBANCE]
+    h = dt / _SUBSTEPS
+    place_vehicle(w, np.int64(0), c, force_max, h)
     for i in range(PLANT_SIZE):
-        predicted[i] = memory[_PLANT + i]
-    for k in range(_ROWS):
-        for i in range(N_DISTURBANCE):
-            table[0, 0, k, i] = memory[1 + i] + memory[1 + N_DISTURBANCE + i]
-    load_vehicle(w, 0, 1, predicted, memory[_COMMAND:], force_max, c, dt / _SUBSTEPS)
-    advance(w, 1, 1, 0, _SUBSTEPS, dt / _SUBSTEPS, table, which, which)
-    if not (store_vehicle(w, 0, 1, predicted) and _residual(plant, predicted, dt, c, correction)):
+        w[PLANT + i * LANES] = memory[_PLANT + i]
+    for i in range(N_INPUT):
+        w[COMMAND + i * LANES] = memory[_COMMAND + i]
+    for i in range(N_DISTURBANCE):
+        d = memory[1 + i] + memory[1 + N_DISTURBANCE + i]
+        w[AIR_FIRST + i * LANES], w[AIR_MIDDLE + i * LANES], w[AIR_LAST + i * LANES] = d, d, d
+    set_out(w)
+    for _ in range(_SUBSTEPS):
+        disturbed_substep(w, h)
+    arrive(w)
+    for i in range(PLANT_SIZE):
+        predicted[i] = w[PLANT + i * LANES]
+    if not (w[FINITE] > 0.0 and _residual(plant, predicted, dt, c, correction)):
         return
     weight = 4.0 * c[HOVER_FORCE]
     arm = math.hypot(c[ROLL_GAIN], c[ROLL_CROSS]) / c[INV_JX]

@@ -8,7 +8,7 @@ importing this module fails, and `_numba` compiles in numba's plain way.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -74,16 +74,18 @@ class _InnerCompiler(CompilerBase):
 class NestedKernel(CPUDispatcher):
     """A function compiled into the kernels that call it, and on its own when Python calls it."""
 
-    def __init__(self, function: Callable[..., Any], entry: Any, inline: bool) -> None:
-        options = {
+    def __init__(
+        self, function: Callable[..., Any], entry: Any, inline: bool, options: Mapping[str, Any]
+    ) -> None:
+        own = {
+            **options,
             "nopython": True,
             "boundscheck": None,
-            "error_model": "numpy",
             "forceinline": inline,
             "no_cpython_wrapper": True,
             "no_cfunc_wrapper": True,
         }
-        super().__init__(py_func=function, targetoptions=options, pipeline_class=_InnerCompiler)
+        super().__init__(py_func=function, targetoptions=own, pipeline_class=_InnerCompiler)
         self.entry = entry  # what a call from Python runs; hot paths call it without the detour below
 
     def __call__(self, *args: Any) -> Any:

@@ -37,15 +37,15 @@ Int = int | np.int64  # an argument that a kernel may be given as a constant, se
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def _compile(function: Function, inline: bool) -> Function:
+def _compile(function: Function, inline: bool, fused: bool = False) -> Function:
     if getattr(config, "DISABLE_JIT", False):
         return function
-    options: Any = {"error_model": "numpy"}
+    options: Any = {"error_model": "numpy", "fastmath": {"contract"} if fused else False}
     if NestedKernel is None:
-        return cast(Function, numba.njit(forceinline=inline, **options)(function))
-    entry = cast(Any, numba.njit(**options)(function))
+        return cast(Function, numba.njit(forceinline=inline, nogil=fused, **options)(function))
+    entry = cast(Any, numba.njit(nogil=fused, **options)(function))
     entry._cache = KernelCache(entry)
-    return cast(Function, NestedKernel(function, entry, inline))
+    return cast(Function, NestedKernel(function, entry, inline, options))
 
 
 def kernel(function: Function) -> Function:
@@ -56,6 +56,21 @@ def kernel(function: Function) -> Function:
 def inline_kernel(function: Function) -> Function:
     """As `kernel`, but LLVM always inlines it into its caller, so that loops around it vectorise."""
     return _compile(function, inline=True)
+
+
+def lane_kernel(function: Function) -> Function:
+    """As `kernel`, for loops over lanes: multiply-adds round once, and threads may run it side by side."""
+    return _compile(function, inline=False, fused=True)
+
+
+def inline_lane_kernel(function: Function) -> Function:
+    """As `inline_kernel`, for loops over lanes: multiply-adds round once."""
+    return _compile(function, inline=True, fused=True)
+
+
+def fused(compiled: Function) -> Function:
+    """The same inline kernel for loops over lanes: multiply-adds round once."""
+    return inline_lane_kernel(getattr(compiled, "py_func", compiled))
 
 
 def entry_of(compiled: Function) -> Function:

@@ -14,6 +14,7 @@ from typing import Any, ClassVar, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ._numba import kernel
 from .authority import hover_authority
 from .kinds import as_tuple, is_number, make_kind, refuse_class, without_booleans
 from .limits import Limits
@@ -113,6 +114,28 @@ _FORCE_SHARE = 0.25  # and not above
 _FORCE_OF_WEIGHT = 1.0 / 16.0  # 0.49 N of the default vehicle
 
 
+@kernel
+def _gauss_markov(x: Array, size: Array, keep: float, fresh: float, out: Array) -> None:
+    """First-order Gauss-Markov processes at the nodes of all steps.
+
+    Args:
+        x: White noise, (steps (nodes - 1) + 1, 6); becomes x_i = keep x_i-1 + fresh size x_i.
+        size: Standard deviations, (6,).
+        keep: What is left of a value after the time between nodes.
+        fresh: sqrt(1 - keep^2).
+        out: Result, (steps, nodes, 6); the last node of a step is the first one of the next.
+    """
+    for c in range(6):
+        x[0, c] *= size[c]
+    for i in range(1, x.shape[0]):
+        for c in range(6):
+            x[i, c] = x[i, c] * size[c] * fresh + keep * x[i - 1, c]
+    for k in range(out.shape[0]):
+        for node in range(out.shape[1]):
+            for c in range(6):
+                out[k, node, c] = x[k * (out.shape[1] - 1) + node, c]
+
+
 @dataclass(frozen=True, slots=True)
 class Gusts:
     """Force and torque as first-order Gauss-Markov processes: turbulence with a correlation time.
@@ -167,12 +190,10 @@ class Gusts:
         steps, nodes = t.shape
         times = np.append(t[:, :-1].ravel(), t[-1, -1])
         keep = math.exp(-float(times[1] - times[0]) / self.correlation_time)
-        white = rng.standard_normal((times.size, 6)) * self.size()
-        white[1:] *= math.sqrt(1.0 - keep * keep)
-        for i in range(1, times.size):
-            white[i] += keep * white[i - 1]
-        index = np.arange(steps)[:, None] * (nodes - 1) + np.arange(nodes)
-        return np.asarray(white[index])
+        out = np.empty((steps, nodes, 6))
+        white = rng.standard_normal((times.size, 6))
+        _gauss_markov(white, self.size(), keep, math.sqrt(1.0 - keep * keep), out)
+        return out
 
 
 @dataclass(frozen=True, slots=True)

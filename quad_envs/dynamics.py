@@ -1,22 +1,51 @@
 """Equations of motion of one quadrotor, Eqs. (2.32) to (2.38) corrected, and their integrator.
 
-`rigid_body` is the one compiled statement of the derivative. The single environment, the vector environment
-and the exact NMPC all call it; `derivative_reference` is its readable twin on numpy arrays.
+`derivative` is the one compiled statement of them. The environments and, through `rigid_body`, the exact NMPC
+call it; `derivative_reference` is its readable twin on numpy arrays.
 
 The integrator is RK4 on the 12 rigid-body states with the rotor lag in closed form (RK4 on all 16 states is
-unstable for one substep of 0.05 s, since lambda_F h > 1). It works on columns ("lanes") of a flat scratch
-array, so that the same code runs one vehicle (stride 1) or a block of vehicles whose loop LLVM vectorises
-(stride LANES).
+unstable for one substep of 0.05 s, since lambda_F h > 1). It flies four vehicles at a time, the lanes of a
+block (`quad_envs.lanes`); sines and cosines are turned with the attitude from stage to stage.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ._numba import Int, inline_kernel, kernel
+from ._numba import Int, fused, inline_kernel, inline_lane_kernel, kernel, lane_kernel
+from .lanes import (
+    AIR_FIRST,
+    AIR_LAST,
+    AIR_MIDDLE,
+    COEFFICIENTS,
+    COMMAND,
+    DECAY,
+    FINITE,
+    FORCE_MAX,
+    FORCES,
+    LANES,
+    MOVED,
+    MOVED_FORCES,
+    N_FLIGHT,
+    N_PLANT,
+    PHI,
+    PLANT,
+    PSI,
+    SINES,
+    TARGET,
+    THETA,
+    four,
+    plus,
+    put_four,
+    put_six,
+    put_twelve,
+    six,
+    twelve,
+)
 from .parameters import (
     ATTITUDE,
     DRAG_RATE,
@@ -28,8 +57,8 @@ from .parameters import (
     INV_JY,
     INV_JZ,
     INV_MASS,
+    N_COEFFICIENTS,
     N_INPUT,
-    N_MOTION_COEFFICIENTS,
     N_STATE,
     PITCH_CROSS,
     PITCH_GAIN,
@@ -46,27 +75,71 @@ from .parameters import (
 from .rotations import euler_rate_matrix, rotation_body_from_inertial, sincos
 
 LARGEST = 1e30  # sum of a plant's |entries| from which it is lost: float32 observations must hold it
-LANES = 32  # vehicles in one vectorised block: its scratch stays in the first-level cache
 
-# Rows of the integrator's scratch; entry i of lane j is w[i * stride + j].
-_X = 0  # state at the start of the substep
-_F = 12  # rotor forces there
-_CMD = 16  # saturated rotor commands
-_Y = 20  # state at the present stage
-_ACC = 32  # weighted sum of the stage derivatives
-_TORQUE = 44  # disturbance torque at the present stage, body axes
-_FORCE = 47  # disturbance force at the present stage, inertial axes
-_COEFFICIENTS = 50  # the first N_MOTION_COEFFICIENTS of QuadrotorParams.coefficients()
-_DECAY = 64  # rotor decay at the present stage
-_DECAY_NONE, _DECAY_HALF, _DECAY_WHOLE = 65, 66, 67  # after no, half and a whole substep
-SCRATCH_ROWS = 68
+
+@inline_kernel
+def derivative(
+    x: Sequence[float],
+    sines: Sequence[float],
+    F: Sequence[float],
+    d: Sequence[float] | None,
+    c: Sequence[float],
+) -> tuple[float, ...]:
+    """Derivative of the 12 states, Eq. (2.32) with T = sum F > 0 along -z_B, rotations axis by axis.
+
+    Args:
+        x: State [p, V_B, Theta, Omega], 12 numbers (array or tuple).
+        sines: Sine and cosine of roll, pitch and yaw, 6 numbers.
+        F: Rotor forces, 4 numbers, N.
+        d: Disturbance, 6 numbers: torque in body axes, N m, then force in inertial axes, N. None in calm air.
+        c: QuadrotorParams.coefficients().
+
+    Returns:
+        Tuple of 12.
+    """
+    u, v, w = x[3], x[4], x[5]
+    p, q, r = x[9], x[10], x[11]
+    sf, cf, st, ct, ss, cs = sines
+    # V_B in axes without roll, then without pitch; the yaw makes p' of it.
+    right, down = cf * v - sf * w, sf * v + cf * w
+    forward = ct * u + st * down
+    turn = (sf * q + cf * r) / ct  # psi'
+    alpha_x = c[GYRO_X] * q * r + c[ROLL_GAIN] * (F[3] - F[1]) + c[ROLL_CROSS] * (F[2] - F[0])
+    alpha_y = c[GYRO_Y] * p * r + c[PITCH_GAIN] * (F[0] - F[2]) + c[PITCH_CROSS] * (F[3] - F[1])
+    alpha_z = c[GYRO_Z] * p * q + c[YAW_GAIN] * (F[1] - F[0] + F[3] - F[2])
+    # Gravity and the disturbance per mass go the other way, from inertial to body axes.
+    if d is None:
+        along = ct * c[GRAVITY]
+        gx, gy, gz = -st * c[GRAVITY], sf * along, cf * along
+    else:
+        fx, fy, fz = d[3] * c[INV_MASS], d[4] * c[INV_MASS], d[5] * c[INV_MASS] + c[GRAVITY]
+        ahead, aside = cs * fx + ss * fy, cs * fy - ss * fx
+        along = st * ahead + ct * fz
+        gx, gy, gz = ct * ahead - st * fz, cf * aside + sf * along, cf * along - sf * aside
+        alpha_x += c[INV_JX] * d[0]
+        alpha_y += c[INV_JY] * d[1]
+        alpha_z += c[INV_JZ] * d[2]
+    return (
+        cs * forward - ss * right,
+        ss * forward + cs * right,
+        ct * down - st * u,
+        r * v - q * w + gx - c[DRAG_RATE] * u,
+        p * w - r * u + gy - c[DRAG_RATE] * v,
+        q * u - p * v + gz - c[DRAG_RATE] * w - (F[0] + F[1] + F[2] + F[3]) * c[INV_MASS],
+        p + st * turn,
+        cf * q - sf * r,
+        turn,
+        alpha_x,
+        alpha_y,
+        alpha_z,
+    )
 
 
 @inline_kernel
 def rigid_body(
     x: Sequence[float], F: Sequence[float], d: Sequence[float], c: Sequence[float]
 ) -> tuple[float, ...]:
-    """Derivative of the 12 states, Eq. (2.32) with T = sum F > 0 along -z_B.
+    """Derivative of the 12 states, Eq. (2.32).
 
     Args:
         x: State [p, V_B, Theta, Omega], 12 numbers (array or tuple).
@@ -77,34 +150,7 @@ def rigid_body(
     Returns:
         Tuple of 12.
     """
-    u, v, w = x[3], x[4], x[5]
-    p, q, r = x[9], x[10], x[11]
-    sf, cf = sincos(x[6])
-    st, ct = sincos(x[7])
-    ss, cs = sincos(x[8])
-    r11, r12, r13 = ct * cs, ct * ss, -st
-    r21, r22, r23 = st * cs * sf - ss * cf, st * ss * sf + cs * cf, ct * sf
-    r31, r32, r33 = st * cs * cf + ss * sf, st * ss * cf - cs * sf, ct * cf
-    fx, fy, fz = d[3] * c[INV_MASS], d[4] * c[INV_MASS], d[5] * c[INV_MASS] + c[GRAVITY]
-    turn = (sf * q + cf * r) / ct  # psi'
-    return (
-        r11 * u + r21 * v + r31 * w,
-        r12 * u + r22 * v + r32 * w,
-        r13 * u + r23 * v + r33 * w,
-        r * v - q * w + (r11 * fx + r12 * fy + r13 * fz) - c[DRAG_RATE] * u,
-        p * w - r * u + (r21 * fx + r22 * fy + r23 * fz) - c[DRAG_RATE] * v,
-        q * u
-        - p * v
-        + (r31 * fx + r32 * fy + r33 * fz)
-        - c[DRAG_RATE] * w
-        - (F[0] + F[1] + F[2] + F[3]) * c[INV_MASS],
-        p + st * turn,
-        cf * q - sf * r,
-        turn,
-        c[GYRO_X] * q * r + c[ROLL_GAIN] * (F[3] - F[1]) + c[ROLL_CROSS] * (F[2] - F[0]) + c[INV_JX] * d[0],
-        c[GYRO_Y] * p * r + c[PITCH_GAIN] * (F[0] - F[2]) + c[PITCH_CROSS] * (F[3] - F[1]) + c[INV_JY] * d[1],
-        c[GYRO_Z] * p * q + c[YAW_GAIN] * (F[1] - F[0] + F[3] - F[2]) + c[INV_JZ] * d[2],
-    )
+    return derivative(x, sincos(x[6]) + sincos(x[7]) + sincos(x[8]), F, d, c)
 
 
 @inline_kernel
@@ -165,225 +211,174 @@ def derivative_reference(
     return out
 
 
-# In these helpers `o` is the place of an entry in the scratch array. Places and strides are passed as int64
-# expressions, never as literals: numba would compile the helper anew for each literal.
-@inline_kernel
-def _four(w: Array, o: Int, stride: Int) -> tuple[float, float, float, float]:
-    """Four entries of one lane."""
-    return w[o], w[o + stride], w[o + 2 * stride], w[o + 3 * stride]
+# Coefficients of the series of sine and cosine.
+_S3, _S5, _S7, _S9, _S11 = ((-1.0) ** (k // 2) / math.factorial(k) for k in (3, 5, 7, 9, 11))
+_C2, _C4, _C6, _C8, _C10, _C12 = ((-1.0) ** (k // 2) / math.factorial(k) for k in (2, 4, 6, 8, 10, 12))
+derivative_in_lanes, sincos_in_lanes = fused(derivative), fused(sincos)
 
 
-@inline_kernel
-def _twelve(w: Array, o: Int, stride: Int) -> tuple[float, ...]:
-    """Twelve entries of one lane."""
-    return _four(w, o, stride) + _four(w, o + 4 * stride, stride) + _four(w, o + 8 * stride, stride)
-
-
-@inline_kernel
-def _lagged(force: float, command: float, decay: float) -> float:
-    """Rotor force after the decay, Eq. (2.38) in closed form."""
-    return command + (force - command) * decay
-
-
-@inline_kernel
-def _accumulate(w: Array, o: Int, stride: Int, slope: float, weight: float, ahead: float) -> None:
-    """Take one component's stage derivative into the weighted sum; move the component to the next stage."""
-    w[o + _ACC * stride] += weight * slope
-    w[o + _Y * stride] = w[o + _X * stride] + ahead * slope
-
-
-@inline_kernel
-def _lane_stage(w: Array, j: Int, stride: Int, weight: float, ahead: float) -> None:
-    """One stage of RK4 for lane j."""
-    decay = w[_DECAY * stride + j]
-    F = _four(w, _F * stride + j, stride)
-    command = _four(w, _CMD * stride + j, stride)
-    F = (
-        _lagged(F[0], command[0], decay),
-        _lagged(F[1], command[1], decay),
-        _lagged(F[2], command[2], decay),
-        _lagged(F[3], command[3], decay),
+@inline_lane_kernel
+def lagged(F: tuple[float, ...], target: tuple[float, ...], decay: float) -> tuple[float, ...]:
+    """Rotor forces after a while, Eq. (2.38) in closed form; `decay` is left of what they lack."""
+    return (
+        target[0] + (F[0] - target[0]) * decay,
+        target[1] + (F[1] - target[1]) * decay,
+        target[2] + (F[2] - target[2]) * decay,
+        target[3] + (F[3] - target[3]) * decay,
     )
-    d = (*_four(w, _TORQUE * stride + j, stride)[:3], *_four(w, _FORCE * stride + j, stride)[:3])
-    o = (_COEFFICIENTS + 12) * stride + j
-    c = (*_twelve(w, _COEFFICIENTS * stride + j, stride), w[o], w[o + stride])
-    k = rigid_body(_twelve(w, _Y * stride + j, stride), F, d, c)
-    _accumulate(w, j, stride, k[0], weight, ahead)
-    _accumulate(w, j + stride, stride, k[1], weight, ahead)
-    _accumulate(w, j + 2 * stride, stride, k[2], weight, ahead)
-    _accumulate(w, j + 3 * stride, stride, k[3], weight, ahead)
-    _accumulate(w, j + 4 * stride, stride, k[4], weight, ahead)
-    _accumulate(w, j + 5 * stride, stride, k[5], weight, ahead)
-    _accumulate(w, j + 6 * stride, stride, k[6], weight, ahead)
-    _accumulate(w, j + 7 * stride, stride, k[7], weight, ahead)
-    _accumulate(w, j + 8 * stride, stride, k[8], weight, ahead)
-    _accumulate(w, j + 9 * stride, stride, k[9], weight, ahead)
-    _accumulate(w, j + 10 * stride, stride, k[10], weight, ahead)
-    _accumulate(w, j + 11 * stride, stride, k[11], weight, ahead)
 
 
-@kernel
-def _stage(w: Array, stride: Int, decay_row: int, weight: float, ahead: float) -> None:
-    """One stage of RK4 for all lanes; rotor forces decay by scratch row `decay_row`.
+@inline_lane_kernel
+def _turned(s: float, c: float, d: float) -> tuple[float, float]:
+    """Sine and cosine of an angle + d from those of the angle, by the addition theorem.
 
-    Strides, rows and trip counts in the loop are constants: only so can LLVM prove the lanes independent.
+    The series of sin d and cos d - 1 end with d^11 / 11! and d^12 / 12!: for 0.5 rad in a substep the error
+    is 2e-14, far below that of RK4, whose terms end with the fourth power.
     """
-    for j in range(stride):
-        w[_DECAY * stride + j] = w[decay_row * stride + j]
-    if stride == 1:
-        _lane_stage(w, np.int64(0), np.int64(1), weight, ahead)
-    else:
+    z = d * d
+    sine = d + d * z * (_S3 + z * (_S5 + z * (_S7 + z * (_S9 + z * _S11))))
+    less = z * (_C2 + z * (_C4 + z * (_C6 + z * (_C8 + z * (_C10 + z * _C12)))))
+    return s + (s * less + c * sine), c + (c * less - s * sine)
+
+
+@inline_lane_kernel
+def turned(sines: tuple[float, ...], k: tuple[float, ...], h: float) -> tuple[float, ...]:
+    """Sines and cosines of an attitude after h times its rate in the derivative k."""
+    return (
+        _turned(sines[0], sines[1], h * k[6])
+        + _turned(sines[2], sines[3], h * k[7])
+        + _turned(sines[4], sines[5], h * k[8])
+    )
+
+
+def _make_substep(disturbed: bool) -> Callable[[Array, float], None]:
+    """The kernel of a substep with disturbances or without, since LLVM may not leave out 0 x by itself."""
+
+    @lane_kernel
+    def substep(w: Array, h: float) -> None:
+        """One RK4 step of a block; the rotors lag in closed form."""
         for j in range(LANES):
-            _lane_stage(w, j, np.int64(LANES), weight, ahead)
+            x, target = twelve(w, MOVED + j), four(w, TARGET + j)
+            F_0 = four(w, MOVED_FORCES + j)
+            sines, decay = six(w, SINES + j), w[DECAY + j]
+            c = twelve(w, COEFFICIENTS + j) + four(w, COEFFICIENTS + 12 * LANES + j)
+            d_1 = six(w, AIR_FIRST + j) if disturbed else None
+            d_2 = six(w, AIR_MIDDLE + j) if disturbed else None
+            d_3 = six(w, AIR_LAST + j) if disturbed else None
+            F_1 = lagged(F_0, target, decay)
+            F_2 = lagged(F_1, target, decay)
+            k_1 = derivative_in_lanes(x, sines, F_0, d_1, c)
+            k_2 = derivative_in_lanes(plus(x, k_1, 0.5 * h), turned(sines, k_1, 0.5 * h), F_1, d_2, c)
+            k_3 = derivative_in_lanes(plus(x, k_2, 0.5 * h), turned(sines, k_2, 0.5 * h), F_1, d_2, c)
+            k_4 = derivative_in_lanes(plus(x, k_3, h), turned(sines, k_3, h), F_2, d_3, c)
+            slope = plus(plus(plus(k_1, k_2, 2.0), k_3, 2.0), k_4, 1.0)
+            put_twelve(w, MOVED + j, plus(x, slope, h / 6.0))
+            put_six(w, SINES + j, turned(sines, slope, h / 6.0))
+            put_four(w, MOVED_FORCES + j, F_2)
+
+    return substep
 
 
-@kernel
-def _finish_substep(w: Array, stride: Int, sixth: float) -> None:
-    """X <- x + h/6 (k1 + 2 k2 + 2 k3 + k4); the rotor forces move on by a whole substep."""
-    for i in range(N_STATE):
-        for o in range(i * stride, (i + 1) * stride):
-            moved = w[o + _X * stride] + sixth * w[o + _ACC * stride]
-            w[o + _X * stride] = moved
-            w[o + _Y * stride] = moved
-            w[o + _ACC * stride] = 0.0
-    for i in range(N_INPUT):
-        for j in range(stride):
-            k = i * stride + j
-            w[k + _F * stride] = _lagged(
-                w[k + _F * stride], w[k + _CMD * stride], w[_DECAY_WHOLE * stride + j]
-            )
-
-
-@kernel
-def _load_disturbance(
-    w: Array,
-    stride: Int,
-    lanes: int,
-    disturbances: Array,
-    which: NDArray[np.int64],
-    step: NDArray[np.int64],
-    node: int,
-) -> None:
-    """Read the disturbance of each lane at one stage time."""
-    for j in range(lanes):
-        row = min(step[j], disturbances.shape[1] - 1)
-        for i in range(6):
-            w[(_TORQUE + i) * stride + j] = disturbances[which[j], row, node, i]
+calm_substep, disturbed_substep = _make_substep(False), _make_substep(True)
 
 
 @inline_kernel
-def load_vehicle(
-    w: Array,
-    j: Int,
-    stride: Int,
-    plant: Array,
-    command: Array,
-    force_max: Array,
-    coefficients: Array,
-    h: float,
-) -> None:
-    """Put one vehicle into lane j.
+def place_vehicle(w: Array, j: Int, c: Array, force_max: Array, h: float) -> None:
+    """Which vehicle flies in lane j.
 
     Args:
-        w: Scratch, (SCRATCH_ROWS * stride,).
+        w: Block.
         j: Lane.
-        stride: 1 or LANES.
-        plant: [p, V_B, Theta, Omega, F], (16,).
-        command: Rotor commands, (4,), N; the plant saturates them to [0, force_max], Eq. (2.39).
+        c: QuadrotorParams.coefficients().
         force_max: Largest force of each rotor, (4,), N.
-        coefficients: QuadrotorParams.coefficients().
         h: Substep, s.
     """
-    for i in range(N_STATE):
-        w[(_X + i) * stride + j] = plant[i]
-        w[(_Y + i) * stride + j] = plant[i]
-        w[(_ACC + i) * stride + j] = 0.0
+    for i in range(N_COEFFICIENTS):
+        w[COEFFICIENTS + i * LANES + j] = c[i]
     for i in range(N_INPUT):
-        w[(_F + i) * stride + j] = plant[N_STATE + i]
-        w[(_CMD + i) * stride + j] = min(max(command[i], 0.0), force_max[i])
-    for i in range(6):
-        w[(_TORQUE + i) * stride + j] = 0.0
-    for i in range(N_MOTION_COEFFICIENTS):
-        w[(_COEFFICIENTS + i) * stride + j] = coefficients[i]
-    half = np.exp(-0.5 * coefficients[ROTOR_RATE] * h)
-    w[_DECAY_NONE * stride + j] = 1.0
-    w[_DECAY_HALF * stride + j] = half
-    w[_DECAY_WHOLE * stride + j] = half * half
+        w[FORCE_MAX + i * LANES + j] = force_max[i]
+    w[DECAY + j] = math.exp(-0.5 * c[ROTOR_RATE] * h)
+
+
+@inline_lane_kernel
+def depart(w: Array, j: Int) -> None:
+    """Begin a control period in lane j: rotors tend to the commands within [0, FORCE_MAX], Eq. (2.39)."""
+    put_twelve(w, MOVED + j, twelve(w, PLANT + j))
+    put_four(w, MOVED_FORCES + j, four(w, FORCES + j))
+    command, most = four(w, COMMAND + j), four(w, FORCE_MAX + j)
+    w[TARGET + j] = min(max(command[0], 0.0), most[0])
+    w[TARGET + LANES + j] = min(max(command[1], 0.0), most[1])
+    w[TARGET + 2 * LANES + j] = min(max(command[2], 0.0), most[2])
+    w[TARGET + 3 * LANES + j] = min(max(command[3], 0.0), most[3])
+
+
+@lane_kernel
+def set_out(w: Array) -> None:
+    """Begin a control period of a block whose plants and commands were set."""
+    for j in range(LANES):
+        depart(w, j)
+        sines = sincos_in_lanes(w[PHI + j]) + sincos_in_lanes(w[THETA + j]) + sincos_in_lanes(w[PSI + j])
+        put_six(w, SINES + j, sines)
 
 
 @inline_kernel
-def store_vehicle(w: Array, j: Int, stride: Int, plant: Array) -> bool:
-    """Copy lane j to a plant row if its numbers are below LARGEST, else leave it; whether they are."""
-    total = 0.0
-    for i in range(N_STATE + N_INPUT):
-        total += abs(w[(_X + i) * stride + j])
-    finite = total < LARGEST
-    if finite:
-        for i in range(N_STATE + N_INPUT):
-            plant[i] = w[(_X + i) * stride + j]
-    return finite
+def load_air(w: Array, j: Int, nodes: Array, s: Int) -> None:
+    """The disturbance of lane j in substep s, from its values at the stage times, (>= 2 s + 3, 6)."""
+    for i in range(6):
+        w[AIR_FIRST + i * LANES + j] = nodes[2 * s, i]
+        w[AIR_MIDDLE + i * LANES + j] = nodes[2 * s + 1, i]
+        w[AIR_LAST + i * LANES + j] = nodes[2 * s + 2, i]
 
 
-@kernel
-def advance(
-    w: Array,
-    stride: Int,
-    lanes: int,
-    first: int,
-    end: int,
-    h: float,
-    disturbances: Array,
-    which: NDArray[np.int64],
-    step: NDArray[np.int64],
-) -> None:
-    """Integrate the loaded lanes over substeps first..end-1 of one control period.
+@inline_lane_kernel
+def _size(a: tuple[float, ...]) -> float:
+    return abs(a[0]) + abs(a[1]) + abs(a[2]) + abs(a[3])
 
-    Args:
-        w: Scratch with `lanes` loaded vehicles; the lanes up to `stride` must hold finite numbers.
-        stride: 1 or LANES.
-        lanes: Number of vehicles, <= stride.
-        first: First RK4 step, 0 at the beginning of the control period.
-        end: Number of the RK4 step to stop before.
-        h: Length of one of them, s.
-        disturbances: Tables (n_tables, n_steps, 2 substeps + 1, 6); n_steps = 0 means none.
-        which: Table of each lane, (>= lanes,) int64.
-        step: Control step of each lane, (>= lanes,) int64; the last row holds on.
-    """
-    disturbed = disturbances.shape[1] > 0
-    for s in range(first, end):
-        if disturbed:
-            _load_disturbance(w, stride, lanes, disturbances, which, step, 2 * s)
-        _stage(w, stride, _DECAY_NONE, 1.0, 0.5 * h)
-        if disturbed:
-            _load_disturbance(w, stride, lanes, disturbances, which, step, 2 * s + 1)
-        _stage(w, stride, _DECAY_HALF, 2.0, 0.5 * h)
-        _stage(w, stride, _DECAY_HALF, 2.0, h)
-        if disturbed:
-            _load_disturbance(w, stride, lanes, disturbances, which, step, 2 * s + 2)
-        _stage(w, stride, _DECAY_WHOLE, 1.0, 0.0)
-        _finish_substep(w, stride, h / 6.0)
+
+@inline_lane_kernel
+def _either(first: bool, a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, ...]:
+    """The one or the other four numbers, without a branch."""
+    return (
+        a[0] if first else b[0],
+        a[1] if first else b[1],
+        a[2] if first else b[2],
+        a[3] if first else b[3],
+    )
+
+
+@lane_kernel
+def arrive(w: Array) -> None:
+    """End a control period of a block: plants whose numbers are below LARGEST have moved, others stay."""
+    for j in range(LANES):
+        moved, forces = twelve(w, MOVED + j), four(w, MOVED_FORCES + j)
+        before, forces_before = twelve(w, PLANT + j), four(w, FORCES + j)
+        finite = _size(moved[:4]) + _size(moved[4:8]) + _size(moved[8:]) + _size(forces) < LARGEST
+        w[FINITE + j] = 1.0 if finite else 0.0
+        put_four(w, PLANT + j, _either(finite, moved[:4], before[:4]))
+        put_four(w, PLANT + 4 * LANES + j, _either(finite, moved[4:8], before[4:8]))
+        put_four(w, PLANT + 8 * LANES + j, _either(finite, moved[8:], before[8:]))
+        put_four(w, FORCES + j, _either(finite, forces, forces_before))
 
 
 @kernel
 def _simulate(
-    plants: Array,
-    commands: Array,
-    force_max: Array,
-    coefficients: Array,
-    substeps: int,
-    h: float,
-    w: Array,
-    which: NDArray[np.int64],
-    step: NDArray[np.int64],
-    disturbances: Array,
+    plants: Array, commands: Array, force_max: Array, coefficients: Array, substeps: int, h: float, w: Array
 ) -> None:
-    for j in range(plants.shape[0]):
-        load_vehicle(w, 0, 1, plants[j], commands[j], force_max, coefficients, h)
-        advance(w, 1, 1, 0, substeps, h, disturbances, which, step)
-        store_vehicle(w, 0, 1, plants[j])
-
-
-NO_DISTURBANCE = np.zeros((1, 0, 1, 6))
+    for first in range(0, plants.shape[0], LANES):
+        lanes = min(LANES, plants.shape[0] - first)
+        for j in range(lanes):
+            place_vehicle(w, j, coefficients, force_max, h)
+            for i in range(N_PLANT):
+                w[PLANT + i * LANES + j] = plants[first + j, i]
+            for i in range(N_INPUT):
+                w[COMMAND + i * LANES + j] = commands[first + j, i]
+        set_out(w)
+        for _ in range(substeps):
+            calm_substep(w, h)
+        arrive(w)
+        for j in range(lanes):
+            for i in range(N_PLANT):
+                plants[first + j, i] = w[PLANT + i * LANES + j]
 
 
 def rotor_limits(force_max: ArrayLike | None, params: QuadrotorParams) -> Array:
@@ -426,9 +421,6 @@ def simulate(
         params.coefficients(),
         substeps,
         duration / substeps,
-        np.zeros(SCRATCH_ROWS),
-        np.zeros(1, dtype=np.int64),
-        np.zeros(1, dtype=np.int64),
-        NO_DISTURBANCE,
+        np.zeros(N_FLIGHT),
     )
     return plants.reshape(start.shape)

@@ -11,9 +11,9 @@ from .limits import Limits
 from .observations.team import AgentLayout
 from .observations.tracking import TrackingLayout
 from .parameters import Array, QuadrotorParams, Weights
+from .reward import LOSS_PARTS as LOSS_PARTS
 
 _Triple = tuple[float, float, float]
-LOSS_PARTS = ("position", "velocity", "attitude", "rates", "effort", "formation")  # of the stage cost
 CRASH_CAUSES = ("", "distance", "tilt", "arena", "not finite", "lost")
 
 

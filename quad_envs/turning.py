@@ -13,12 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ._numba import inline_kernel, kernel
-from .observations.tracking import N_REFERENCE
-from .parameters import Array
+from .plant import Array
 from .rotations import wrap_angle
+from .table_row import HEADING, N_REFERENCE, N_TABLE
+from .table_row import TURN_RATE as TURN_RATE
 
-TURN_RATE = N_REFERENCE  # place of psi_dot in a row of a table, behind what a reference gives
-N_TABLE = N_REFERENCE + 1
 LARGEST_TURN = 2.0 * math.pi  # rad/s; what turns faster, jumps
 _AGREEMENT = 1.0  # rad/s, by which the rates before and after a row may differ where it does not jump
 
@@ -68,15 +67,38 @@ def turn_rate(window: Array, stages: int, i: int, dt: float) -> float:
     return _one_rate(near, _difference(window, 1 if i == 0 else stages - 3, dt), near)
 
 
+@kernel
+def tabulate(rows: Array, dt: float, fastest: float, out: Array) -> bool:
+    """`with_turn_rates` compiled, and whether the rows are finite and nowhere faster than `fastest`.
+
+    Args:
+        rows: Reference rows, (n, 8).
+        dt: Time between them, s.
+        fastest: m/s.
+        out: Result, (n, N_TABLE).
+    """
+    sound = True
+    for i in range(rows.shape[0]):
+        total = 0.0
+        for c in range(N_REFERENCE):
+            out[i, c] = rows[i, c]
+            total += abs(rows[i, c])
+        square = rows[i, 3] ** 2 + rows[i, 4] ** 2 + rows[i, 5] ** 2
+        sound &= (total < math.inf) & (square <= fastest * fastest)
+        out[i, TURN_RATE] = turn_rate(rows, rows.shape[0], i, dt)
+        out[i, HEADING] = math.atan2(rows[i, 6], rows[i, 7])
+    return sound
+
+
 def with_turn_rates(rows: ArrayLike, dt: float) -> Array:
-    """Reference rows (n, 8) with psi_dot as a ninth column, readable twin of `turn_rate`: (n, 9)."""
+    """Reference rows (n, 8) with psi_dot and psi behind them, readable twin of `tabulate`: (n, N_TABLE)."""
     rows = np.asarray(rows, dtype=np.float64)
     out = np.zeros((len(rows), N_TABLE))
-    out[:, :N_REFERENCE] = rows
+    out[:, :N_REFERENCE] = rows[:, :N_REFERENCE]
+    out[:, HEADING] = psi = np.arctan2(rows[:, 6], rows[:, 7])
     if len(rows) < 2:
         return out
     same = (rows[1:, 6:] == rows[:-1, 6:]).all(axis=1)
-    psi = np.arctan2(rows[:, 6], rows[:, 7])
     steps = np.where(same, 0.0, wrap_angle(np.diff(psi)) / dt)
     # At the ends the row beyond counts as if the heading turned on as it did.
     second = min(1, len(steps) - 1)

@@ -6,7 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quad_envs.dynamics import SCRATCH_ROWS, advance, load_vehicle, store_vehicle
+from quad_envs._numba import kernel
+from quad_envs.dynamics import arrive, disturbed_substep, load_air, place_vehicle, set_out
+from quad_envs.lanes import COMMAND, LANES, N_FLIGHT, PLANT
 from quad_envs.parameters import Limits
 from quad_envs.rotations import rotation_body_from_inertial, wrap_angle
 from quad_envs.tasks import Task
@@ -73,15 +75,23 @@ class Flight(NamedTuple):
     fallbacks: np.ndarray  # (steps,)
 
 
+@kernel
+def _hold(w, c, force_max, table, h):
+    place_vehicle(w, np.int64(0), c, force_max, h)
+    set_out(w)
+    for s in range(SUBSTEPS):
+        load_air(w, np.int64(0), table, s)
+        disturbed_substep(w, h)
+    arrive(w)
+
+
 def held_under(plant, command, task, disturbance, k):
     """One control period under a disturbance, a function of time."""
     table = np.array([disturbance(DT * (k + i / (2 * SUBSTEPS))) for i in range(2 * SUBSTEPS + 1)])
-    w, zero, out = np.zeros(SCRATCH_ROWS), np.zeros(1, dtype=np.int64), plant.copy()
-    h = task.dt / SUBSTEPS
-    load_vehicle(w, 0, 1, out, command, task.force_max, task.params.coefficients(), h)
-    advance(w, 1, 1, 0, SUBSTEPS, h, table[None, None], zero, zero)
-    store_vehicle(w, 0, 1, out)
-    return out
+    w = np.zeros(N_FLIGHT)
+    w[PLANT : PLANT + 16 * LANES : LANES], w[COMMAND : COMMAND + 4 * LANES : LANES] = plant, command
+    _hold(w, task.params.coefficients(), task.force_max, table, task.dt / SUBSTEPS)
+    return w[PLANT : PLANT + 16 * LANES : LANES].copy()
 
 
 def calm(t):

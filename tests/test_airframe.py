@@ -10,6 +10,7 @@ from controllers.team.central import CentralMpc
 from quad_envs._numba import kernel
 from quad_envs.adjoint import step_vjp
 from quad_envs.dynamics import derivative_reference, rigid_body, rotor_shares, simulate
+from quad_envs.lanes import FORCE_MAX
 from quad_envs.parameters import RATES, Limits, QuadrotorParams
 from quad_envs.tasks import Task, TeamTask
 
@@ -149,7 +150,7 @@ def test_a_turn_by_45_degrees_makes_an_x_frame_of_a_plus_frame():
 def test_randomized_rotors_keep_their_proportions():
     env = gym.make("quad/HelixTracking-v0", kappa=UNEVEN, randomize={"kappa": 0.15})
     env.reset(seed=0)
-    found = env.unwrapped._batch.rows[0, 36:40] / env.unwrapped.task.force_max
+    found = env.unwrapped._batch.vehicles.read(FORCE_MAX, 4)[0] / env.unwrapped.task.force_max
     assert np.ptp(found) < 1e-15 and 0.85 < found[0] < 1.15 and found[0] != 1.0
 
 

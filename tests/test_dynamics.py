@@ -6,16 +6,11 @@ from scipy.integrate import solve_ivp
 
 from quad_envs._numba import kernel
 from quad_envs.dynamics import (
-    LANES,
-    NO_DISTURBANCE,
-    SCRATCH_ROWS,
-    advance,
     derivative_reference,
-    load_vehicle,
     rigid_body,
     simulate,
-    store_vehicle,
 )
+from quad_envs.lanes import LANES
 from quad_envs.parameters import QuadrotorParams
 from quad_envs.rotations import (
     euler_rate_matrix,
@@ -170,29 +165,13 @@ def test_commands_beyond_the_rotor_limits_saturate():
     assert np.array_equal(after, same)
 
 
-def test_a_block_of_lanes_equals_one_vehicle_at_a_time_bit_for_bit():
+def test_vehicles_side_by_side_equal_one_at_a_time_bit_for_bit():
     rng = np.random.default_rng(3)
-    plants = np.concatenate([random_states(rng, LANES), rng.uniform(0, 7, (LANES, 4))], axis=1)
-    commands = rng.uniform(0, 7, (LANES, 4))
-    single = simulate(plants, commands, PARAMS)
-    block = plants.copy()
-    _advance_block(
-        block, commands, PARAMS.coefficients(), np.zeros(SCRATCH_ROWS * LANES), np.zeros(LANES, np.int64)
-    )
-    assert np.array_equal(block, single)
-
-
-@kernel
-def _block(plants, commands, force_max, coefficients, w, index, none):
-    for j in range(LANES):
-        load_vehicle(w, j, np.int64(LANES), plants[j], commands[j], force_max, coefficients, 0.01)
-    advance(w, np.int64(LANES), LANES, 0, 5, 0.01, none, index, index)
-    for j in range(LANES):
-        store_vehicle(w, j, np.int64(LANES), plants[j])
-
-
-def _advance_block(plants, commands, coefficients, w, index):
-    _block(plants, commands, np.full(4, PARAMS.weight), coefficients, w, index, NO_DISTURBANCE)
+    n = 4 * LANES + 1
+    plants = np.concatenate([random_states(rng, n), rng.uniform(0, 7, (n, 4))], axis=1)
+    commands = rng.uniform(0, 7, (n, 4))
+    one_by_one = [simulate(plant, command, PARAMS) for plant, command in zip(plants, commands, strict=True)]
+    assert np.array_equal(simulate(plants, commands, PARAMS), one_by_one)
 
 
 def test_a_state_that_would_not_stay_finite_is_left_as_it_was():

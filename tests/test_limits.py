@@ -11,8 +11,8 @@ from baselines import make_policy, measure, run_episodes
 from controllers.mpc.mpc import limit_rows
 from quad_envs import Limits, formation_v0
 from quad_envs.constraints import constraint_names, constraint_scales, constraint_values, forces_from_actions
+from quad_envs.envs.shared.task_vector import task_vector
 from quad_envs.envs.tracking.adjoint import reward_vjp
-from quad_envs.envs.tracking.kernel import task_vector
 from quad_envs.limits import LIMITS, LimitOptions
 from quad_envs.plant import N_STATE, POSITION
 

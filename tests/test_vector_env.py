@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from quad_envs.envs.tracking.kernel import BLOCK_FROM
+from quad_envs.lanes import LANES
 from quad_envs.registration import TRACKING
 
 RANDOM = {
@@ -37,7 +37,7 @@ def assert_info_row(infos, i, info):
 
 
 @pytest.mark.parametrize("env_id", TRACKING)
-@pytest.mark.parametrize("n", [N, BLOCK_FROM + 3])
+@pytest.mark.parametrize("n", [N, 2 * LANES + 3])
 def test_rows_equal_single_environments_across_next_step_autoreset(env_id, n):
     vector, singles = make_pair(env_id, n, **RANDOM)
     rng = np.random.default_rng(0)

@@ -12,23 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_envs.adjoint import SCRATCH_ROWS
+from quad_envs.envs.shared.task_vector import task_vector
 from quad_envs.envs.tracking.adjoint import action_slopes, tracking_vjp_rows
 from quad_envs.envs.tracking.batch import TrackingBatch
-from quad_envs.envs.tracking.kernel import (
-    COEFFICIENTS,
-    COMMAND,
-    CRASHED,
-    FORCE_MAX,
-    PLANT,
-    REWARD,
-    STEP,
-    TRUNCATED,
-    task_vector,
-)
 from quad_envs.envs.tracking.options import TrackingOptions
+from quad_envs.envs.tracking.scores import scores_of
+from quad_envs.lanes import COEFFICIENTS, COMMAND, FORCE_MAX, N_PLANT, PLANT, STEP
 from quad_envs.observations.features import Features, default_features, preview_stages
-from quad_envs.observations.tracking import N_REFERENCE
-from quad_envs.parameters import Array
+from quad_envs.parameters import N_COEFFICIENTS
+from quad_envs.plant import N_INPUT, Array
+from quad_envs.table_row import N_REFERENCE
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float32]
@@ -42,7 +35,7 @@ class Record(NamedTuple):
     commands: Array  # (n, 4), N
     previous: Array  # (n, 4), N, commands of the step before
     after: Array  # (n, 16), afterwards, before any reset
-    references: Array  # (n, 9), of the time afterwards
+    references: Array  # (n, N_TABLE), of the time afterwards
     crashed: Bools  # (n,)
     force_max: Array  # (n, 4), N
     coefficients: Array  # (n, N_COEFFICIENTS)
@@ -78,20 +71,25 @@ class DifferentiableFlights:
         self._out = np.empty((n, self.task.layout.size), dtype=np.float32)
         # The first episodes are cut at random, so that the flights are at all times of the episode.
         self._cut = self.rng.integers(1, self.task.episode_steps + 1, n)
-        for i in range(n):
-            self.batch.reset_row(i, self.rng, self._out[i])
+        self._told = self.batch.fresh_scores()
+        self._begin(np.arange(n))
+
+    def _begin(self, index: NDArray[np.int64]) -> None:
+        self.batch.begin(index, [self.rng] * len(index), self._out.reshape(-1), self._told)
 
     def observe(self) -> Floats:
         """Scaled features of all flights as they are, (n, features)."""
-        rows, references = self.batch.rows, self.batch.references
-        p, psi = rows[:, None, :3], rows[:, 8:9]
-        steps = rows[:, STEP].astype(np.int64)[:, None] + self._stages
+        vehicles, references = self.batch.vehicles, self.batch.references
+        plants = vehicles.read(PLANT, N_PLANT)
+        p, psi = plants[:, None, :3], plants[:, 8:9]
+        steps = vehicles.read(STEP).astype(np.int64)[:, None] + self._stages
         preview = references[self.batch.which[0][:, None], np.minimum(steps, references.shape[1] - 1)]
         preview = preview[:, :, :N_REFERENCE]
         preview[:, :, :3] -= p
-        parts = [rows[:, 3:8], np.sin(psi), np.cos(psi), rows[:, 9:20]]
+        commands = vehicles.read(COMMAND, N_INPUT)
+        parts = [plants[:, 3:8], np.sin(psi), np.cos(psi), plants[:, 9:], commands]
         if self.task.layout.position:
-            parts.append(rows[:, :3])
+            parts.append(plants[:, :3])
         parts.append(preview.reshape(self.n, -1))
         scaled = (np.concatenate(parts, axis=1) - self._mean) / self._scale
         return np.asarray(scaled, dtype=np.float32)
@@ -111,30 +109,30 @@ class DifferentiableFlights:
 
     def advance(self, actions: Floats) -> Record:
         """One step of all flights; those that end begin anew."""
-        rows, references = self.batch.rows, self.batch.references
-        plants, previous = rows[:, PLANT].copy(), rows[:, COMMAND].copy()
-        self.batch.step(actions, self._out)
+        vehicles, references = self.batch.vehicles, self.batch.references
+        plants, previous = vehicles.read(PLANT, N_PLANT), vehicles.read(COMMAND, N_INPUT)
+        self.batch.step(np.ascontiguousarray(actions).reshape(-1), self._out.reshape(-1), self._told)
+        scores = scores_of(self._told.copy())
         slopes = np.empty((self.n, 4))
         action_slopes(actions, self._vector, slopes)
-        steps = np.minimum(rows[:, STEP].astype(np.int64), references.shape[1] - 1)
-        crashed = rows[:, CRASHED] > 0.0
+        steps = np.minimum(vehicles.read(STEP).astype(np.int64), references.shape[1] - 1)
         self._cut -= 1
-        done = crashed | (rows[:, TRUNCATED] > 0.0) | (self._cut == 0)
+        done = scores.crashed | scores.truncated | (self._cut == 0)
         record = Record(
             plants=plants,
-            commands=rows[:, COMMAND].copy(),
+            commands=vehicles.read(COMMAND, N_INPUT),
             previous=previous,
-            after=rows[:, PLANT].copy(),
+            after=vehicles.read(PLANT, N_PLANT),
             references=references[self.batch.which[0], steps],
-            crashed=crashed,
-            force_max=rows[:, FORCE_MAX].copy(),
-            coefficients=rows[:, COEFFICIENTS].copy(),
+            crashed=scores.crashed,
+            force_max=vehicles.read(FORCE_MAX, N_INPUT),
+            coefficients=vehicles.read(COEFFICIENTS, N_COEFFICIENTS),
             slopes=slopes,
-            rewards=rows[:, REWARD].copy(),
+            rewards=scores.reward,
             done=done,
         )
-        for i in np.flatnonzero(done).tolist():
-            self.batch.reset_row(i, self.rng, self._out[i])
+        if done.any():
+            self._begin(np.flatnonzero(done))
         return record
 
     def advance_vjp(

@@ -21,7 +21,6 @@ from quad_envs.encoding import Encoder, Encoding
 from quad_envs.envs.team.batch import TeamBatch
 from quad_envs.envs.team.options import TeamOptions
 from quad_envs.envs.tracking.batch import TrackingBatch
-from quad_envs.envs.tracking.kernel import COST, CRASHED, REWARD, TRUNCATED, VIOLATED
 from quad_envs.envs.tracking.options import TrackingOptions
 from quad_envs.names import shown
 from quad_envs.observations.features import Features, default_features
@@ -83,6 +82,7 @@ class TrainingVecEnv(VecEnv):
             self._size = options.vehicles
         else:
             self._batch, self._size = TrackingBatch(options, n), 1
+        self._told = self._batch.fresh_scores()
         if isinstance(self.task, TeamTask) and self.task.mission == "estimation":
             raise ValueError(
                 f"actions of {self.task.env_id} are estimates, and this trains networks that command rotors: "
@@ -135,8 +135,7 @@ class TrainingVecEnv(VecEnv):
 
     def reset(self) -> Floats:
         """Begin all episodes."""
-        for group in range(self._n):
-            self._begin(group)
+        self._begin(np.arange(self._n))
         if self._staggered:
             self._left[:] = self._stagger.integers(1, self._steps_of_episode + 1, self._n)
         self.costs = np.zeros(self.num_envs)
@@ -154,16 +153,13 @@ class TrainingVecEnv(VecEnv):
             Features, rewards, where an episode ended, and infos: empty but where an episode ended. There are
             `terminal_observation` (features), `TimeLimit.truncated`.
         """
-        self._batch.step(self._actions, self._out)
-        rows = self._batch.rows
-        rewards = rows[:, REWARD].astype(np.float32)
-        self.costs, self.violated = rows[:, COST].copy(), rows[:, VIOLATED] > 0.0
+        truncated = self._step()
+        rewards = self._rewards.astype(np.float32)
         self._steps += 1
         self._reward += float(rewards.sum())
         self._violations += int(np.count_nonzero(self.violated))
-        self.crashed = rows[:, CRASHED] > 0.0
         self._left -= 1
-        ended = (self.crashed | (rows[:, TRUNCATED] > 0.0)).reshape(self._n, self._size).all(axis=1)
+        ended = (self.crashed | truncated).reshape(self._n, self._size).all(axis=1)
         ended |= self._left == 0
         if not ended.any():
             return self._scaled(self._out), rewards, np.zeros(self.num_envs, dtype=np.bool_), self._infos[:]
@@ -174,9 +170,16 @@ class TrainingVecEnv(VecEnv):
                 "terminal_observation": features,
                 "TimeLimit.truncated": not bool(self.crashed[row]),
             }
-        for group in np.flatnonzero(ended).tolist():
-            self._begin(group)
+        self._begin(np.flatnonzero(ended))
         return self._scaled(self._out), rewards, dones, infos
+
+    def _step(self) -> Bools:
+        """Move all rows, and take over their scores; which rows are at the end of their time."""
+        self._batch.step(self._actions.reshape(-1), self._out.reshape(-1), self._told)
+        scores = self._batch.scores(self._told.copy())
+        self._rewards, self.costs = scores.reward, scores.cost
+        self.violated, self.crashed = scores.violated, scores.crashed
+        return scores.truncated
 
     def tally(self) -> Tally:
         """Means since the last call."""
@@ -185,14 +188,11 @@ class TrainingVecEnv(VecEnv):
         self._steps, self._reward, self._violations = 0, 0.0, 0
         return means
 
-    def _begin(self, group: int) -> None:
-        """A new episode of one flight or team."""
-        self._left[group] = self._steps_of_episode
-        if isinstance(self._batch, TeamBatch):
-            mine = self._out[group * self._size : (group + 1) * self._size]
-            self._batch.reset_team(group, self._generators[group], mine)
-        else:
-            self._batch.reset_row(group, self._generators[group], self._out[group])
+    def _begin(self, groups: NDArray[np.int64]) -> None:
+        """New episodes of some flights or teams."""
+        self._left[groups] = self._steps_of_episode
+        generators = [self._generators[group] for group in groups.tolist()]
+        self._batch.begin(groups, generators, self._out.reshape(-1), self._told)
 
     def _scaled(self, observations: Floats) -> Floats:
         return self.encoder.see(observations)

@@ -183,7 +183,7 @@ def begin_row(
     if which is not None:
         kept = memory[1 + MEMORY_STAGE * N :]
         update_estimate(
-            plant, kept, data.gain, data.coefficients, data.dt, data.force_max, s.estimate, s.work, which
+            plant, kept, data.gain, data.coefficients, data.dt, data.force_max, s.estimate, s.work
         )
     for i in range(N_DISTURBANCE):
         s.d[i] = revealed[i] + s.estimate[i]

@@ -12,17 +12,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..constraints import TOLERANCE
+from ..lanes import (
+    ALIVE,
+    CRASHED,
+    MEASURES,
+    MOST_VALUES,
+    N_PLANT,
+    NEAREST,
+    PLANT,
+    REWARD,
+    SLOT_ERROR,
+    STEP,
+    TRUNCATED,
+    VALUES,
+    VIOLATED,
+)
 from ..limits import UNITS
 from ..parameters import POSITION, VELOCITY, Array
 from ..pictures.scenes import Framing, Scene
 from ..pictures.window import Window
 from ..tasks import Task, TeamTask
 from .team.batch import TeamBatch
-from .team.exchange import ALIVE, MEASURES, NEAREST, SENT, SLOT_ERROR, WEIGHT
+from .team.exchange import SENT, WEIGHT
 from .team.kernel import ESTIMATE_REACH, ESTIMATE_SPEED
 from .team.options import EstimationOptions
 from .tracking.batch import TrackingBatch
-from .tracking.kernel import CRASHED, PLANT, REWARD, STEP, TRUNCATED, VALUES, VIOLATED
 
 _TRAIL = 3.0  # s
 _OVERVIEW_POINTS = 120
@@ -56,22 +70,29 @@ class Pictures:
     def _task(self) -> Task | TeamTask:
         return self._flying.task
 
+    def _read(self, row: int, count: int = 1) -> Array:
+        """One quantity of the vehicles, (n,), or some that follow each other, (n, count)."""
+        return self._flying.vehicles.read(row, count)[self._vehicles]
+
     @property
-    def _rows(self) -> Array:
-        """Of the vehicles; a view that is taken anew each time, so that an environment can be copied."""
-        return self._flying.rows[self._vehicles]
+    def _plants(self) -> Array:
+        return self._read(PLANT, N_PLANT)
+
+    @property
+    def _step(self) -> int:
+        return int(self._read(STEP)[0])
 
     def record(self, actions: NDArray[np.float32] | None = None) -> None:
         """Take the present moment down, and the actions that led there; a reset begins anew."""
-        if self._rows[0, STEP] == 0.0:
+        if self._step == 0:
             self._trail.clear()
             self._rewards, self._estimates = 0.0, self._estimates[:0]
             self._wanted, self._target = self._wishes()
             seen = np.concatenate([self._wanted, self._target[None]]) if len(self._target) else self._wanted
             self._framing = Framing(seen, self._box, self._task.dt)
         else:
-            self._rewards += float(self._rows[:, REWARD].mean())
-        self._trail.append(self._rows[:, PLANT][:, POSITION].copy())
+            self._rewards += float(self._read(REWARD).mean())
+        self._trail.append(self._plants[:, POSITION])
 
     def frame(self) -> NDArray[np.uint8]:
         """The picture of the present moment, (height, width, 3).
@@ -91,11 +112,11 @@ class Pictures:
         """
         if self._framing is None:
             raise gymnasium.error.ResetNeeded("call reset() before render()")
-        rows, task, k = self._rows, self._task, int(self._rows[0, STEP])
-        sound = np.isfinite(rows[:, PLANT]).all(axis=1)
+        plants, task, k = self._plants, self._task, self._step
+        sound = np.isfinite(plants).all(axis=1)
         flies = sound & self._alive()
-        who, plants = np.flatnonzero(flies), rows[flies, PLANT]
-        values = rows[flies, VALUES : VALUES + len(task.constraint_names)]
+        who, wrecks, plants = np.flatnonzero(flies), plants[~flies & sound], plants[flies]
+        values = self._read(VALUES, MOST_VALUES)[flies, : len(task.constraint_names)]
         names = task.constraint_names
         aim = self._target[max(0, k + 1 - len(self._trail)) : k + 1]
         path, links = self._path(), self._links(who)
@@ -108,10 +129,10 @@ class Pictures:
             plants=plants,
             numbers=tuple(who.tolist()),
             leader=int(leader[0]) if leader.size else -1,
-            violated=rows[flies, VIOLATED] > 0.0,
+            violated=self._read(VIOLATED)[flies] > 0.0,
             crowded=_too_near(names, values),
             trails=np.array(self._trail)[:, flies],
-            wrecks=rows[~flies & sound, PLANT][:, POSITION],
+            wrecks=wrecks[:, POSITION],
             behind=path[max(0, k - round(2.0 * _TRAIL / task.dt)) : k + 1],
             ahead=path[k:],
             slots=self._wanted[flies[: len(self._wanted)], min(k, self._wanted.shape[1] - 1)],
@@ -140,9 +161,9 @@ class Pictures:
         )
 
     def _ending(self) -> str:
-        if (self._rows[:, CRASHED] > 0.0).all():
+        if (self._read(CRASHED) > 0.0).all():
             return "crashed"
-        return "time limit" if (self._rows[:, TRUNCATED] > 0.0).any() else ""
+        return "time limit" if (self._read(TRUNCATED) > 0.0).any() else ""
 
     def _wishes(self) -> tuple[Array, Array]:
         """Wanted positions (n, T+1, 3) and the target's (T+1, 3), no rows where there is none."""
@@ -153,10 +174,10 @@ class Pictures:
         return np.asarray(self._wanted[0])
 
     def _alive(self) -> NDArray[np.bool_]:
-        return np.ones(len(self._rows), dtype=np.bool_)
+        return np.ones(len(self._plants), dtype=np.bool_)
 
     def _sights(self) -> NDArray[np.bool_]:
-        return np.zeros(len(self._rows), dtype=np.bool_)
+        return np.zeros(len(self._plants), dtype=np.bool_)
 
     def _leader(self) -> int:
         return -1
@@ -178,7 +199,7 @@ class TrackingPictures(Pictures):
         return np.asarray(rows[None, :, POSITION]), np.zeros((0, 3))
 
     def _lines(self, k: int) -> tuple[str, ...]:
-        p = self._rows[0, PLANT][POSITION]
+        p = self._plants[0, POSITION]
         off = float(np.linalg.norm(p - self._wanted[0, min(k, self._wanted.shape[1] - 1)]))
         return (*super()._lines(k), f"position error {off:.2f} m", f"height {0.0 - p[2]:.2f} m")
 
@@ -198,11 +219,10 @@ class TeamPictures(Pictures):
         """Take the present moment down; on rails the actions are estimates, carried on to the present."""
         super().record(actions)
         if self._on_rails and actions is not None:
-            told = np.clip(actions.reshape(len(self._rows), -1), -1.0, 1.0)
-            drift = ESTIMATE_SPEED * told[:, 3:] - self._rows[:, PLANT][:, VELOCITY]
-            self._estimates = (
-                self._rows[:, PLANT][:, POSITION] + ESTIMATE_REACH * told[:, :3] + self._task.dt * drift
-            )
+            plants = self._plants
+            told = np.clip(actions.reshape(len(plants), -1), -1.0, 1.0)
+            drift = ESTIMATE_SPEED * told[:, 3:] - plants[:, VELOCITY]
+            self._estimates = plants[:, POSITION] + ESTIMATE_REACH * told[:, :3] + self._task.dt * drift
         if self._mode == "human":
             self._show_in_window()
 
@@ -231,7 +251,7 @@ class TeamPictures(Pictures):
         if not self._on_rails:
             return batch.wanted(0)[..., POSITION], target
         times = self._task.dt * np.arange(self._task.episode_steps + 1)[:, None]
-        plants = self._rows[:, PLANT]
+        plants = self._plants
         return plants[:, None, POSITION] + plants[:, None, VELOCITY] * times, target
 
     @property
@@ -243,7 +263,7 @@ class TeamPictures(Pictures):
 
     def _lines(self, k: int) -> tuple[str, ...]:
         flies = self._alive()
-        error, near = self._rows[flies, SLOT_ERROR], self._rows[flies, NEAREST]
+        error, near = self._read(SLOT_ERROR)[flies], self._read(NEAREST)[flies]
         if not error.size:
             return super()._lines(k)
         what = "estimates off by" if self._on_rails else "slot error"
@@ -251,16 +271,16 @@ class TeamPictures(Pictures):
         return lines if self._on_rails else (*lines, f"nearest pair {near.min():.2f} m")
 
     def _alive(self) -> NDArray[np.bool_]:
-        return np.asarray(self._rows[:, ALIVE] > 0.0)
+        return np.asarray(self._read(ALIVE) > 0.0)
 
     def _sights(self) -> NDArray[np.bool_]:
-        return np.asarray(self._rows[:, MEASURES] > 0.0) & self._has_target
+        return np.asarray(self._read(MEASURES) > 0.0) & self._has_target
 
     def _leader(self) -> int:
         return 0 if self._batch.options.has_leader else -1
 
     def _links(self, who: NDArray[np.int64]) -> Array:
-        batch, k = self._batch, self._rows[0, STEP]
+        batch, k = self._batch, self._step
         heard, lifetime = batch.heard(0)[who], batch.options.message_lifetime
         age = (k - heard[..., SENT]) * self._task.dt
         i, s = np.nonzero((heard[..., WEIGHT] > 0.0) & (age <= lifetime + 1e-9))

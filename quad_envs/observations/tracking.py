@@ -10,19 +10,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .._numba import inline_kernel
-from ..parameters import Array
+from .._intrinsics import write_stage
+from .._numba import Int, inline_kernel
+from ..lanes import COMMAND, COS_PSI, FORCES, PLANT, SIN_PSI, STEP, four, plus, twelve
+from ..plant import Array
 from ..rotations import sincos
+from ..table_row import N_REFERENCE as N_REFERENCE
 
 N_OWN = 18
-N_REFERENCE = 8  # p_ref (or p_ref - p) 3, v_ref 3 (inertial), sin psi_ref, cos psi_ref
 
 
 class TrackingView(NamedTuple):
@@ -143,25 +145,56 @@ def vehicle_parts(part: Mapping[str, Array], batch: tuple[int, ...]) -> dict[str
 
 
 @inline_kernel
-def encode_own(out: NDArray[np.float32], plant: Array, command: Array) -> None:
-    """Write the `own` block.
+def measured(w: Array, j: Int, noise: Array) -> tuple[tuple[float, ...], tuple[float, float]]:
+    """What the sensors of the vehicle in lane j tell of its state, and sine and cosine of the yaw they tell.
+
+    Args:
+        w: Block.
+        j: Lane.
+        noise: Its measurement errors, (n_steps, 12); no steps for none.
+    """
+    x, yaw = twelve(w, PLANT + j), (w[SIN_PSI + j], w[COS_PSI + j])
+    if noise.shape[0] > 0:
+        x = plus(x, noise[min(int(w[STEP + j]), noise.shape[0] - 1)], 1.0)
+        yaw = sincos(x[8])
+    return x, yaw
+
+
+@inline_kernel
+def encode_own(
+    out: NDArray[np.float32], w: Array, j: Int, x: tuple[float, ...], yaw: tuple[float, float]
+) -> None:
+    """Write the `own` block of the vehicle in lane j.
 
     Args:
         out: Observation, (>= 18,) float32.
-        plant: Measured [p, V_B, Theta, Omega, F], (16,).
-        command: Last rotor commands, (4,), N.
+        w: Block.
+        j: Lane.
+        x: Its state as it is measured.
+        yaw: Sine and cosine of the measured yaw.
     """
-    for i in range(3):
-        out[i] = plant[3 + i]
-        out[7 + i] = plant[9 + i]
-    out[3] = plant[6]
-    out[4] = plant[7]
-    sine, cosine = sincos(plant[8])
-    out[5] = sine
-    out[6] = cosine
-    for i in range(4):
-        out[10 + i] = plant[12 + i]
-        out[14 + i] = command[i]
+    out[0], out[1], out[2] = x[3], x[4], x[5]
+    out[3], out[4], out[5], out[6] = x[6], x[7], yaw[0], yaw[1]
+    out[7], out[8], out[9] = x[9], x[10], x[11]
+    out[10], out[11], out[12], out[13] = four(w, FORCES + j)
+    out[14], out[15], out[16], out[17] = four(w, COMMAND + j)
+
+
+@inline_kernel
+def encode_disturbance(out: NDArray[np.float32], start: int, step: int, disturbance: Array) -> None:
+    """Write torque and force in the middle of the coming period from out[start] on; zero without any.
+
+    Args:
+        out: Observation, float32.
+        start: Where they stand.
+        step: Control step.
+        disturbance: Table, (n_steps, n_nodes, 6).
+    """
+    for i in range(6):
+        out[start + i] = 0.0
+    if step < disturbance.shape[0]:
+        for i in range(6):
+            out[start + i] = disturbance[step, disturbance.shape[1] // 2, i]
 
 
 @inline_kernel
@@ -186,12 +219,8 @@ def decode_own(row: NDArray[np.float32], plant: Array, command: Array) -> None:
 
 @inline_kernel
 def encode_preview(
-    out: NDArray[np.float32], start: int, reference: Array, row: int, stages: int, p: Array
+    out: NDArray[np.float32], start: int, reference: Array, row: int, stages: int, p: Sequence[float] | Array
 ) -> None:
     """Write reference rows row..row+stages-1 from out[start] on, positions relative to p."""
-    target = out[start : start + N_REFERENCE * stages].reshape(stages, N_REFERENCE)
     for q in range(stages):
-        for i in range(3):
-            target[q, i] = reference[row + q, i] - p[i]
-        for i in range(3, N_REFERENCE):
-            target[q, i] = reference[row + q, i]
+        write_stage(out, start + N_REFERENCE * q, reference, row + q, (p[0], p[1], p[2]))

@@ -13,10 +13,12 @@ from typing import ClassVar, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .._numba import kernel
 from ..checks import require_whole
 from ..names import shown
 from ..observations.tracking import N_REFERENCE
 from ..parameters import Array
+from ..rotations import sincos
 from .plausible import FASTEST
 
 _RESTING_SPEED = 0.05  # m/s
@@ -170,6 +172,33 @@ class Racetrack:
         return pack_rows(p, w * v)
 
 
+@kernel
+def _sum_sines(t: Array, amplitude: Array, rate: Array, phase: Array, paths: Array, out: Array) -> None:
+    """Sums of a (sin(w t + phi) - sin(phi)) and their derivatives as rows of a reference.
+
+    Args:
+        t: Times, (n,), s.
+        amplitude: Of each axis and harmonic, (3, H), m.
+        rate: (3, H), rad/s.
+        phase: (3, H), rad.
+        paths: Scratch, zeros, (6, n).
+        out: Result, (n, 8).
+    """
+    for axis in range(3):
+        position, velocity = paths[axis], paths[3 + axis]
+        for i in range(amplitude.shape[1]):
+            a, w, phi = amplitude[axis, i], rate[axis, i], phase[axis, i]
+            first, _ = sincos(phi)
+            for k in range(t.size):
+                sine, cosine = sincos(w * t[k] + phi)
+                position[k] += a * (sine - first)
+                velocity[k] += a * w * cosine
+    for k in range(t.size):
+        for c in range(6):
+            out[k, c] = paths[c, k]
+        out[k, 6], out[k, 7] = 0.0, 1.0
+
+
 @dataclass(frozen=True, slots=True)
 class RandomSmooth:
     """A sum of sines per axis with random amplitudes, rates and phases, shifted to start at the origin.
@@ -206,9 +235,9 @@ class RandomSmooth:
         amplitude = share * np.asarray(self.amplitude)[:, None]
         rate = self.rate_min + (self.rate_max - self.rate_min) * draws[1]
         phase = 2.0 * np.pi * draws[2]
-        angle = t[:, None, None] * rate + phase
-        p = np.sum(amplitude * (np.sin(angle) - np.sin(phase)), axis=2)
-        return pack_rows(p, np.sum(amplitude * rate * np.cos(angle), axis=2))
+        paths, out = np.zeros((6, t.size)), np.empty((t.size, N_REFERENCE))
+        _sum_sines(np.ascontiguousarray(t), amplitude, rate, phase, paths, out)
+        return out
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,27 +10,37 @@ from typing import Any
 
 import numpy as np
 
+from ..._numba import entry_of
 from ...disturbances import Disturbance
 from ...names import shown
 from ...observations.tracking import N_REFERENCE
 from ...parameters import Array
 from ...references import Reference, too_fast
+from ...references.plausible import FASTEST
+from ...table_row import N_TABLE
 from ...tasks import BaseTask
-from ...turning import with_turn_rates
+from ...turning import tabulate
 from .vehicle_options import varied_params
+
+_tabulate = entry_of(tabulate)
 
 
 def reference_rows(reference: Reference, times: Array, rng: np.random.Generator) -> Array:
-    """Reference rows at the control samples (n,) >= 2, with the rate of the heading, (n, 9).
+    """Reference rows at the control samples (n,) >= 2, with rate and angle of the heading, (n, N_TABLE).
 
     Raises:
         ValueError: If the reference gives another shape or a number that is not finite, or is too fast.
     """
-    rows = checked_rows("reference", reference, reference.rows(times, rng), times, N_REFERENCE)
+    given = reference.rows(times, rng)
+    rows = np.ascontiguousarray(given, dtype=np.float64)
+    table = np.empty((times.size, N_TABLE))
+    if rows.shape == (times.size, N_REFERENCE) and _tabulate(rows, times[1] - times[0], FASTEST, table):
+        return table
+    rows = checked_rows("reference", reference, given, times, N_REFERENCE)
     said = too_fast(rows[:, 3:6], times)
     if said:
         raise ValueError(f"reference {shown(reference)} {said}")
-    return with_turn_rates(rows, float(times[1] - times[0]))
+    return table
 
 
 def checked_rows(kind: str, source: object, rows: Any, times: Array, width: int) -> Array:

@@ -1,16 +1,12 @@
-"""What the native vector environments share: a generator per flight or team, and infos of rows."""
+"""What the native vector environments share: a generator per flight or team, and masks."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
-
-from ...parameters import Array
-from ..tracking.kernel import CAUSE, CLIPPED, COST, CRASHED, EPISODE_COST, STAGE_COST, VALUES, VIOLATED
 
 Generators = list[np.random.Generator]
 
@@ -44,25 +40,8 @@ def seeded(
     return [new if take else old for take, new, old in zip(anew, fresh, generators, strict=True)]
 
 
-def score_infos(rows: Array, n_values: int) -> dict[str, Any]:
-    """What `info` says of every row, copied.
-
-    Args:
-        rows: Vehicles, (n, ...), see `kernel`.
-        n_values: Number of constraints.
-    """
-    return {
-        "cost": rows[:, COST].copy(),
-        "episode_cost": rows[:, EPISODE_COST].copy(),
-        "constraint_violation": rows[:, VIOLATED] > 0.0,
-        "constraint_values": rows[:, VALUES : VALUES + n_values].copy(),
-        "stage_cost": rows[:, STAGE_COST].copy(),
-        "crashed": rows[:, CRASHED] > 0.0,
-        "crash_cause": rows[:, CAUSE].astype(np.int64),
-        "clipped_actions": rows[:, CLIPPED].astype(np.int64),
-    }
-
-
-def with_presence(info: dict[str, Any], n: int) -> dict[str, Any]:
-    """The info of n rows, and beside each key the mask `_key` that Gymnasium's vectors have: all have it."""
-    return info | {f"_{key}": np.ones(n, dtype=np.bool_) for key in info}
+def presence(n: int, names: Iterable[str]) -> dict[str, NDArray[np.bool_]]:
+    """The masks `_name` of Gymnasium's vectors beside each info: all rows have it; read-only."""
+    mask = np.ones(n, dtype=np.bool_)
+    mask.flags.writeable = False
+    return {f"_{name}": mask for name in names}

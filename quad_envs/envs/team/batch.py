@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,31 +12,46 @@ from numpy.typing import NDArray
 from ..._numba import entry_of
 from ...checks import array_bytes, require_memory
 from ...constraints import constraint_scales
-from ...dynamics import LANES
 from ...formations import start_positions
 from ...graphs import in_neighbours
+from ...lanes import (
+    COEFFICIENTS,
+    DECAY,
+    FORCE_MAX,
+    LANES,
+    MEASURES,
+    MOST_VALUES,
+    N_PLANT,
+    N_TEAM,
+    Blocks,
+)
 from ...names import nearest_name, shown, unknown_name
 from ...observations.tracking import N_REFERENCE
-from ...parameters import N_STATE, Array
+from ...parameters import ROTOR_RATE
+from ...plant import N_STATE, Array
 from ...references import make_reference, pack_rows
 from ...sensors import sensor_rows
+from ...table_row import N_TABLE
 from ...targets import N_TARGET, make_target
-from ...turning import N_TABLE
 from ..shared.given import given_plants
+from ..shared.plan import IntArray, make_plan
 from ..shared.tables import checked_rows, disturbance_rows, draw_vehicle, reference_rows, stage_times
-from ..tracking.kernel import COEFFICIENTS, COMMAND, FORCE_MAX, MOST_VALUES, PLANT, task_vector
-from .exchange import DISTURBANCE, DRAW, HEAD, MEASURES, NOISE, PLAN, REFERENCE, TARGET, TEAM_ROW_SIZE
-from .kernel import begin_team, scratch_size, step_teams
+from ..shared.task_vector import task_vector
+from .exchange import DISTURBANCE, DRAW, HEAD, NOISE, PLAN, REFERENCE, TARGET, Tables
+from .kernel import N_TOLD, Teams, begin_teams, scratch_size, step_teams
 from .options import EstimationOptions, FormationOptions, TargetTrackingOptions, TeamOptions
+from .scores import N_LOSS
+from .told import TeamScores, team_scores
 
-_step = entry_of(step_teams)
+_step, _begin = entry_of(step_teams), entry_of(begin_teams)
+Generators = Sequence[np.random.Generator]
 _RESET_OPTIONS = ("state",)
 
 
 class TeamBatch:
     """`teams` independent flights of one multi-agent task; vehicle i of team t is row t N + i.
 
-    The public arrays are views for reading; `reset_team` and `step` change them.
+    The public arrays are views for reading; `begin` and `step` change them.
     """
 
     def __init__(self, options: TeamOptions, teams: int) -> None:
@@ -46,28 +61,71 @@ class TeamBatch:
         layout = self.task.layout
         content = PLAN + 6 * layout.plan
         shapes = (
-            (teams * self.n, TEAM_ROW_SIZE),
             (teams * self.n, layout.neighbours, HEAD + content),
             (teams, options.delay + 1, self.n, content),
         )
         self._take_choices()
-        self._require_memory(*shapes)
-        self.rows, self._messages, self._history = map(np.zeros, shapes)
-        self._vector = task_vector(self.task, options.substeps, math.inf)
-        self._team = _team_vector(options)
+        self._require_memory((teams * self.n, N_TEAM // LANES), *shapes)
+        self.vehicles = Blocks(teams * self.n, N_TEAM, self.n)
+        self._messages, self._history = map(np.zeros, shapes)
         self.neighbours = np.full((self.n, layout.neighbours), -1, dtype=np.int64)
         found = in_neighbours(self.graphs.graphs)
         self.neighbours[:, : found.shape[1]] = found
         self._make_tables()
-        scratch = np.zeros(scratch_size(self.n, layout.sensed))
-        tables = (self._weights(), self.neighbours, self.graphs.which, self._offsets(), self._which)
-        drawn = (self.references, self.disturbances, self.noises, self.targets, self._draws)
-        self._state = (self.rows, self._messages, self._history, *tables, *drawn)
-        self._begin = (self._vector, self._team, scratch)
-        self._after = (*self._begin, np.zeros(max(self.n, LANES), dtype=np.int64))
+        self._arrays = Teams(
+            self.vehicles.array,
+            self._messages,
+            self._history,
+            Tables(
+                self._weights(),
+                self.neighbours,
+                np.ascontiguousarray(self.graphs.which, dtype=np.int64),
+                self._offsets(),
+                self._which,
+                self.references,
+                self.disturbances,
+                self.noises,
+                self.targets,
+                self._draws,
+            ),
+            task_vector(self.task, options.substeps, math.inf),
+            _team_vector(options),
+            np.zeros(scratch_size(self.n, layout.sensed)),
+        )
+        self._plan = self._make_plan()
+        self._constraints = len(self.task.constraint_names)
+        self._told_shape = N_TOLD + 2 * self._constraints + N_LOSS, teams * self.n
+        self._place(*draw_vehicle(self.task, {}, np.random.default_rng(0)))
         if isinstance(options, TargetTrackingOptions):
             for t in range(teams):
-                self.rows[[t * self.n + i for i in options.informed()], MEASURES] = 1.0
+                for i in options.informed():
+                    self.vehicles.write(MEASURES, np.ones(1), t * self.n + i)
+
+    def _make_plan(self) -> IntArray:
+        before, (tables, *after) = self._arrays[:3], self._arrays[3:]
+        return make_plan((*before, *tables, *after))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in self.__dict__.items() if key != "_plan"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._plan = self._make_plan()
+
+    def fresh_scores(self) -> Array:
+        """Where `begin` and `step` write their scores, see `kernel.N_TOLD`."""
+        return np.empty(self._told_shape)
+
+    def scores(self, told: Array) -> TeamScores:
+        """What is told there."""
+        return team_scores(told, self._constraints)
+
+    def _place(self, vehicle: Array, force_max: Array, i: int | None = None) -> None:
+        """Which vehicle flies in place i, or in all: coefficients, and the largest force of each rotor."""
+        half = 0.5 * self.task.dt / self.options.substeps
+        self.vehicles.write(COEFFICIENTS, vehicle, i)
+        self.vehicles.write(FORCE_MAX, force_max, i)
+        self.vehicles.write(DECAY, np.exp(-half * vehicle[ROTOR_RATE : ROTOR_RATE + 1]), i)
 
     def _take_choices(self) -> None:
         """What is flown, and which of it is drawn at reset."""
@@ -135,7 +193,8 @@ class TeamBatch:
     def _weights(self) -> Array:
         """G_ij per graph and slot, (M, N, K)."""
         i = np.arange(self.n)[:, None]
-        return np.where(self.neighbours >= 0, self.graphs.graphs[:, i, self.neighbours], 0.0)
+        weights = np.where(self.neighbours >= 0, self.graphs.graphs[:, i, self.neighbours], 0.0)
+        return np.ascontiguousarray(weights, dtype=np.float64)
 
     def _offsets(self) -> Array:
         """delta_ij per slot, then the own slot, (N, K + 1, 3)."""
@@ -146,38 +205,43 @@ class TeamBatch:
         out[:, K] = self.slots
         return out
 
-    def reset_team(
+    def begin(
         self,
-        t: int,
-        rng: np.random.Generator,
+        index: IntArray,
+        generators: Generators,
         out: NDArray[np.float32],
+        told: Array,
         options: Mapping[str, Any] | None = None,
     ) -> None:
-        """Begin a new episode of team t and write its first observations.
+        """Begin new episodes, and write their first observations and scores.
 
-        Draws, in this order: starts, vehicles, reference, disturbances, target, own sensors' noise,
-        measurement noise, detections and drop-outs.
+        Draws for each team, in this order: starts, vehicles, reference, disturbances, target, own sensors'
+        noise, measurement noise, detections and drop-outs.
 
         Args:
-            t: Team.
-            rng: The generator of this team.
-            out: Observations, (N, layout.size) float32.
+            index: Teams, (m,).
+            generators: Theirs, m.
+            out: Observations of all, (teams N layout.size,) float32.
+            told: Scores of all, of `fresh_scores`.
             options: `{"state": ...}` puts the plants (N, 12) or (N, 16) there.
 
         Raises:
             ValueError: If the state does not fit, or two vehicles start nearer than the crash distance.
         """
+        given = _given_state(options, self.n, self.task.hover_force)
+        plants = np.empty((len(index), self.n, N_PLANT))
+        for start, t, rng in zip(plants, index.tolist(), generators, strict=True):
+            start[:] = self._start(rng) if given is None else given
+            self.options.require_apart(start[:, :3])
+            self._draw(t, rng)
+        _begin(self._plan, index, plants, out, told, self._constraints)
+
+    def _draw(self, t: int, rng: np.random.Generator) -> None:
+        """What else is drawn for team t."""
         first, n = t * self.n, self.n
-        given = _given_state(options, n, self.task.hover_force)
-        plants = self._start(rng) if given is None else given
-        self.options.require_apart(plants[:, :3])
-        for i in range(n):
-            row = self.rows[first + i]
-            measures = row[MEASURES]
-            row[:] = 0.0
-            row[PLANT], row[MEASURES] = plants[i], measures
-            row[COMMAND] = self.task.hover_force
-            row[COEFFICIENTS], row[FORCE_MAX] = draw_vehicle(self.task, self._randomization, rng)
+        if self._randomization:
+            for i in range(first, first + n):
+                self._place(*draw_vehicle(self.task, self._randomization, rng), i)
         if self._random[REFERENCE]:
             self.references[t] = reference_rows(self._reference, self._times, rng)
         if self._disturbance is not None and self._random[DISTURBANCE]:
@@ -193,7 +257,6 @@ class TeamBatch:
             draws = self._draws[t]
             draws[..., :3] = rng.standard_normal((*draws.shape[:-1], 3))
             draws[..., 3:] = rng.random((*draws.shape[:-1], draws.shape[-1] - 3))
-        begin_team(first, *self._state, *self._begin, out)
 
     def target(self, t: int) -> Array:
         """Rows r, v of the target of team t, a view, (T+1, 6); zero where there is none."""
@@ -220,22 +283,23 @@ class TeamBatch:
         """Weight, sent, received of the last message in each comm slot of team t, a view, (N, K, 3)."""
         return self._messages[t * self.n : (t + 1) * self.n, :, :HEAD]
 
-    def step(self, actions: NDArray[np.floating], out: NDArray[np.float32]) -> None:
-        """Move all teams by one control period and write their observations.
+    def step(self, actions: NDArray[np.float32], out: NDArray[np.float32], told: Array) -> None:
+        """Move all teams by one control period, and write their observations and scores.
 
         Args:
-            actions: (teams N, action_size), contiguous; clipped to [-1, 1], which is counted.
-            out: (teams N, layout.size) float32.
+            actions: (teams N action_size,), contiguous; clipped to [-1, 1], which is counted.
+            out: Observations, (teams N layout.size,).
+            told: Scores, of `fresh_scores`.
 
         Raises:
             ValueError: If an action is not finite; then nobody has moved.
         """
-        bad = _step(*self._state, actions.reshape(-1), *self._after, out.reshape(-1))
+        bad = _step(self._plan, actions, out, told, self._constraints)
         if bad >= 0:
             row, entry = divmod(bad, self.task.action_size)
             raise ValueError(
                 f"action[{entry}] of vehicle {row % self.n} (team {row // self.n}) is "
-                f"{actions.reshape(-1)[bad]}; actions must be finite numbers in [-1, 1]. Nobody has moved."
+                f"{actions[bad]}; actions must be finite numbers in [-1, 1]. Nobody has moved."
             )
 
     def _start(self, rng: np.random.Generator) -> Array:

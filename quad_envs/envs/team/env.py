@@ -11,29 +11,15 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from ...graphs import GraphTable
+from ...lanes import ALIVE, N_PLANT, PLANT, STEP
 from ...names import shown
-from ...observations.tracking import N_REFERENCE
-from ...parameters import Array
+from ...plant import Array
+from ...table_row import N_REFERENCE
 from ...tasks import TeamTask
 from ..shared.render_modes import NO_RENDERING, checked_rendering
-from ..tracking.kernel import (
-    CAUSE,
-    CLIPPED,
-    COST,
-    CRASHED,
-    EPISODE_COST,
-    PLANT,
-    REWARD,
-    STAGE_COST,
-    STEP,
-    TRUNCATED,
-    VALUES,
-    VIOLATED,
-)
 from .batch import TeamBatch
-from .exchange import ALIVE, HEARD, NEAREST, SLOT_ERROR, TERMINATED, TERMS
 from .options import TeamOptions
-from .scores import N_LOSS
+from .told import TeamScores
 
 if TYPE_CHECKING:
     from ..pictures import TeamPictures
@@ -43,14 +29,13 @@ Named = dict[str, Any]
 
 # PettingZoo asks for finite bounds; no state of a flight within the arena comes near.
 _BOUND = 1e6
+_FIRST = np.zeros(1, dtype=np.int64)  # the batch's only team
 _METADATA: dict[str, Any] = {
     "render_modes": ["human", "rgb_array"],
     "render_fps": 20,
     "name": "team",
     "is_parallelizable": True,
 }
-# Entries of a row that `info` tells.
-_SAID = [COST, EPISODE_COST, VIOLATED, STAGE_COST, CRASHED, CAUSE, CLIPPED, SLOT_ERROR, NEAREST, HEARD]
 
 
 class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: ignore[misc]
@@ -111,7 +96,7 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
     @property
     def plants(self) -> Array:
         """Copy of the plants [p, V_B, Theta, Omega, F], (N, 16), for study; policies never see it."""
-        return self._batch.rows[:, PLANT].copy()
+        return self._batch.vehicles.read(PLANT, N_PLANT)
 
     @property
     def references(self) -> Array:
@@ -146,11 +131,11 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
         rows and columns of zeros, G_ii included, for vehicles that crashed; the leader's reference rows
         k..k+N_p (zero without a leader); t / T.
         """
-        batch, k = self._batch, int(self._batch.rows[0, STEP])
+        batch, k = self._batch, int(self._batch.vehicles.read(STEP)[0])
         stages = self.task.layout.preview + 1
         rows = batch.references[0, k : k + stages, :N_REFERENCE]
         preview = rows if batch.options.has_leader else np.zeros((stages, N_REFERENCE))
-        alive = batch.rows[:, ALIVE]
+        alive = batch.vehicles.read(ALIVE)
         graph = batch.graph(k) * alive * alive[:, None]
         parts = (self.plants, batch.target(0)[k], graph, preview, k / self.task.episode_steps)
         return np.concatenate([np.ravel(part) for part in parts])
@@ -161,13 +146,14 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
         """Begin an episode; `options={"state": x}` with (N, 12) or (N, 16) numbers sets the plants."""
         if seed is not None or self.np_random is None:
             self.np_random, _ = seeding.np_random(seed)
-        observations = self._fresh_observations()
-        self._batch.reset_team(0, self.np_random, observations, options)
+        observations, told = self._fresh_observations(), self._batch.fresh_scores()
+        self._batch.begin(_FIRST, [self.np_random], observations.reshape(-1), told, options)
         if self._pictures:
             self._pictures.record()
         self.agents = self.possible_agents.copy()
         self._rows = np.arange(len(self.agents))
-        return dict(zip(self.agents, observations, strict=True)), self._infos()
+        infos = self._infos(self.agents, self._batch.scores(told))
+        return dict(zip(self.agents, observations, strict=True)), infos
 
     def step(
         self, actions: dict[str, NDArray[np.float32]]
@@ -179,25 +165,25 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
         agents = self.agents
         if not agents and actions == {} and self.np_random is not None:
             return {}, {}, {}, {}, {}
-        observations = self._fresh_observations()
+        observations, told = self._fresh_observations(), self._batch.fresh_scores()
         stacked = self._stack(actions)
-        self._batch.step(stacked, observations)
+        self._batch.step(stacked.reshape(-1), observations.reshape(-1), told)
         if self._pictures:
             self._pictures.record(stacked)
-        rows, which = self._batch.rows, self._rows
-        if len(which) < len(rows):
-            rows, observations = rows[which], observations[which]
-        terminated, truncated = rows[:, TERMINATED] > 0.0, rows[:, TRUNCATED] > 0.0
+        scores, which = self._batch.scores(told), self._rows
+        if len(which) < len(self.possible_agents):
+            some: Any = (part[which] for part in scores)
+            scores, observations = TeamScores(*some), observations[which]
+        terminated, truncated = scores.terminated.tolist(), scores.truncated.tolist()
         answer = (
             dict(zip(agents, observations, strict=True)),
-            dict(zip(agents, rows[:, REWARD].tolist(), strict=True)),
-            dict(zip(agents, terminated.tolist(), strict=True)),
-            dict(zip(agents, truncated.tolist(), strict=True)),
-            self._infos(),
+            dict(zip(agents, scores.reward.tolist(), strict=True)),
+            dict(zip(agents, terminated, strict=True)),
+            dict(zip(agents, truncated, strict=True)),
+            self._infos(agents, scores),
         )
-        done = terminated | truncated
-        if done.any():
-            self._rows = which[~done]
+        if True in terminated or True in truncated:
+            self._rows = which[~(scores.terminated | scores.truncated)]
             self.agents = [self.possible_agents[i] for i in self._rows]
         return answer
 
@@ -259,33 +245,40 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
             ):
                 raise ValueError(f"action of {name} must be {self._action_size} numbers, got {shown(action)}")
 
-    def _infos(self) -> dict[str, Named]:
-        rows = self._batch.rows if len(self._rows) == len(self._batch.rows) else self._batch.rows[self._rows]
-        n = len(self.task.constraint_names)
-        infos = [
-            {
+    @staticmethod
+    def _infos(agents: list[str], scores: TeamScores) -> dict[str, Named]:
+        """Info of each agent; arrays are rows of one array of the team."""
+        columns = (
+            scores.cost,
+            scores.episode_cost,
+            scores.violated,
+            scores.stage_cost,
+            scores.crashed,
+            scores.cause,
+            scores.clipped,
+            scores.slot_error,
+            scores.nearest,
+            scores.heard,
+        )
+        rows = zip(agents, *(column.tolist() for column in columns), strict=True)
+        return {
+            name: {
                 "cost": cost,
                 "episode_cost": total,
-                "constraint_violation": violated > 0.0,
+                "constraint_violation": violated,
                 "constraint_values": values,
                 "stage_cost": loss,
-                "crashed": crashed > 0.0,
-                "crash_cause": int(cause),
-                "clipped_actions": int(clipped),
+                "crashed": crashed,
+                "crash_cause": cause,
+                "clipped_actions": clipped,
                 "formation_error": error,
                 "min_separation": nearest,
-                "messages": int(heard),
+                "messages": heard,
                 "reward_terms": terms,
             }
             for (
-                (cost, total, violated, loss, crashed, cause, clipped, error, nearest, heard),
+                (name, cost, total, violated, loss, crashed, cause, clipped, error, nearest, heard),
                 values,
                 terms,
-            ) in zip(
-                rows[:, _SAID].tolist(),
-                rows[:, VALUES : VALUES + n].copy(),
-                rows[:, TERMS : TERMS + N_LOSS + n].copy(),
-                strict=True,
-            )
-        ]
-        return dict(zip(self.agents, infos, strict=True))
+            ) in zip(rows, scores.values, scores.terms, strict=True)
+        }

@@ -12,29 +12,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..._numba import inline_kernel, kernel
+from ..._numba import Int, inline_kernel, kernel
+from ...lanes import ALIVE, HEARD, LANES, MOST_VALUES, SINES, STEP, six
 from ...observations.team import N_COMM, N_MEASURED, N_PLAN_STAGE, N_SENSED
-from ...observations.tracking import N_REFERENCE, encode_preview
-from ...parameters import Array
+from ...observations.tracking import encode_preview, measured
+from ...plant import Array
 from ...rotations import sincos
 from ...sensors import AZIMUTH, RANGE, measure, reads
-from ...tasks import LOSS_PARTS
-from ..tracking.kernel import DT, MOST_VALUES, PREVIEW, ROW_SIZE, STEP, encode_vehicle
-
-IntArray = NDArray[np.int64]
-
-# Entries of a vehicle's row beyond those of `kernel`.
-TERMS = ROW_SIZE  # of the stage cost, then the scaled violation of each named row
-(
-    SLOT_ERROR,  # m, distance to the wanted position
-    NEAREST,  # m, distance to the nearest vehicle, smallest over the substeps
-    HEARD,  # messages received in this step
-    ALIVE,
-    MEASURES,  # whether it has the sensor
-    TERMINATED,
-    LEFT,  # whether it crashed in an earlier step
-    TEAM_ROW_SIZE,
-) = range(TERMS + len(LOSS_PARTS) + MOST_VALUES, TERMS + len(LOSS_PARTS) + MOST_VALUES + 8)
+from ...table_row import N_REFERENCE
+from ..shared.plan import IntArray
+from ..shared.task_vector import DT, PREVIEW
+from ..tracking.kernel import encode_vehicle
 
 # Entries of a message's content, absolute.
 N_MOTION = 10  # p 3, v 3 (inertial), phi, theta, sin psi, cos psi
@@ -74,8 +62,8 @@ class Tables(NamedTuple):
     neighbours: IntArray  # (N, K), sender of each slot, -1 for none
     schedule: IntArray  # (T+1,), graph of each step
     offsets: Array  # (N, K + 1, 3), delta_ij per slot, then p_i* relative to the leader or the target, m
-    which: IntArray  # (5, n), table that a row reads: reference, disturbance, noise, target, draw
-    references: Array  # (n_tables, n_steps, 9), of the leader
+    which: IntArray  # (5, n), table that a vehicle reads: reference, disturbance, noise, target, draw
+    references: Array  # (n_tables, n_steps, N_TABLE), of the leader
     disturbances: Array  # (n_tables, n_steps, n_nodes, 6)
     noises: Array  # (n_tables, n_steps, 12), of the vehicles' own state; no steps for none
     targets: Array  # (n_tables, n_steps, 6), r and v of the target; no steps for none
@@ -89,17 +77,26 @@ REFERENCE, DISTURBANCE, NOISE, TARGET, DRAW = range(5)
 
 
 @inline_kernel
-def motion(plant: Array, out: Array) -> None:
-    """p, inertial v, phi, theta, sin psi, cos psi of a plant (16,), into out (>= 10,)."""
-    sf, cf = sincos(plant[6])
-    st, ct = sincos(plant[7])
-    ss, cs = sincos(plant[8])
-    forward = ct * plant[3] + st * (sf * plant[4] + cf * plant[5])  # in the heading frame
-    right = cf * plant[4] - sf * plant[5]
-    out[0], out[1], out[2] = plant[0], plant[1], plant[2]
+def motion(x: tuple[float, ...], sines: tuple[float, ...], out: Array) -> None:
+    """p, inertial v, phi, theta, sin psi, cos psi of a state (12,) with its sines (6,), into out (>= 10,)."""
+    sf, cf, st, ct, ss, cs = sines
+    down = sf * x[4] + cf * x[5]
+    forward = ct * x[3] + st * down  # in the heading frame
+    right = cf * x[4] - sf * x[5]
+    out[0], out[1], out[2] = x[0], x[1], x[2]
     out[3], out[4] = cs * forward - ss * right, ss * forward + cs * right
-    out[5] = ct * (sf * plant[4] + cf * plant[5]) - st * plant[3]
-    out[6], out[7], out[8], out[9] = plant[6], plant[7], ss, cs
+    out[5] = ct * down - st * x[3]
+    out[6], out[7], out[8], out[9] = x[6], x[7], ss, cs
+
+
+@inline_kernel
+def told_motion(w: Array, j: Int, noise: Array, out: Array) -> None:
+    """Motion of the vehicle in lane j as its own sensors tell it, into out (>= 10,)."""
+    x, _ = measured(w, j, noise)
+    sines = six(w, SINES + j)
+    if noise.shape[0] > 0:
+        sines = sincos(x[6]) + sincos(x[7]) + sincos(x[8])
+    motion(x, sines, out)
 
 
 @inline_kernel
@@ -134,15 +131,15 @@ def measure_target(
 
 @kernel
 def hear(
-    k: int, i: int, rows: Array, first: int, history: Array, tables: Tables, team: Array, messages: Array
+    k: int, i: int, blocks: Array, first: int, history: Array, tables: Tables, team: Array, messages: Array
 ) -> None:
     """Take over the messages that reach vehicle i at step k, and drop those of crashed senders.
 
     Args:
         k: Control step.
         i: Vehicle of the team.
-        rows: All vehicles.
-        first: Row of the team's first one.
+        blocks: Of the team.
+        first: Its first vehicle.
         history: Contents of the team's last steps, (depth, N, C).
         tables: The tables.
         team: Team vector.
@@ -152,12 +149,12 @@ def hear(
     sent = k - (depth - 1)
     graph = tables.weights[tables.schedule[min(max(sent, 0), tables.schedule.shape[0] - 1)], i]
     draws = tables.draws[tables.which[DRAW, first]]
-    rows[first + i, HEARD] = 0.0
+    heard = 0
     for s in range(messages.shape[0]):
         j, message = tables.neighbours[i, s], messages[s]
         if j < 0:
             continue
-        if rows[first + j, ALIVE] == 0.0:
+        if blocks[j // LANES, ALIVE + j % LANES] == 0.0:
             message[WEIGHT] = 0.0
             continue
         if sent < 0 or graph[s] <= 0.0:
@@ -168,20 +165,20 @@ def hear(
         content = history[sent % depth, j]
         for c in range(content.shape[0]):
             message[HEAD + c] = content[c]
-        rows[first + i, HEARD] += 1.0
+        heard += 1
+    blocks[i // LANES, HEARD + i % LANES] = float(heard)
 
 
 @kernel
-def sense(i: int, rows: Array, first: int, motions: Array, team: Array, key: Array, which: Array) -> int:
+def sense(i: int, motions: Array, places: Array, team: Array, key: Array, which: Array) -> int:
     """The most urgent vehicles within the sensing radius of vehicle i, most urgent first.
 
     Approaching ones by the time to contact max(|d| - d_s, 0) / closing speed, then the others by distance.
 
     Args:
         i: Vehicle of the team.
-        rows: All vehicles.
-        first: Row of the team's first one.
         motions: True motions of the team, (N, 10).
+        places: Positions, (3, N); those that crashed are far from everybody.
         team: Team vector.
         key: Scratch, (K_s,).
         which: Result, (K_s,).
@@ -189,13 +186,13 @@ def sense(i: int, rows: Array, first: int, motions: Array, team: Array, key: Arr
     Returns:
         How many there are, at most K_s.
     """
-    n, most, found = motions.shape[0], which.shape[0], 0
+    most, found = which.shape[0], 0
     reach = team[SENSING_RADIUS] * team[SENSING_RADIUS]
     own = motions[i]
-    for j in range(n):
-        dx, dy, dz = motions[j, 0] - own[0], motions[j, 1] - own[1], motions[j, 2] - own[2]
+    for j in range(motions.shape[0]):
+        dx, dy, dz = places[0, j] - own[0], places[1, j] - own[1], places[2, j] - own[2]
         square = dx * dx + dy * dy + dz * dz
-        if square >= reach or j == i or rows[first + j, ALIVE] == 0.0:
+        if square >= reach or j == i:
             continue
         distance = math.sqrt(square)
         parting = (
@@ -271,8 +268,7 @@ def _encode_measurements(
 @kernel
 def observe_agent(
     i: int,
-    row: Array,
-    seen: Array,
+    w: Array,
     own: Array,
     measurement: Array,
     messages: Array,
@@ -280,6 +276,7 @@ def observe_agent(
     offsets: Array,
     reference: Array,
     disturbance: Array,
+    noise: Array,
     sensed: int,
     which: Array,
     task: Array,
@@ -290,8 +287,7 @@ def observe_agent(
 
     Args:
         i: Vehicle of the team.
-        row: Its row.
-        seen: Its plant as it measures it, (16,).
+        w: Its block.
         own: Its motion as it measures it, (10,).
         measurement: Of the target, (5,).
         messages: What it heard, (K, HEAD + C).
@@ -299,14 +295,17 @@ def observe_agent(
         offsets: delta_ij per slot, then its slot, (K + 1, 3).
         reference: The leader's, (n_steps, 9).
         disturbance: Its own, (n_steps, n_nodes, 6).
+        noise: Its measurement errors, (n_steps, 12); no steps for none.
         sensed: How many vehicles it senses.
         which: Those, (K_s,).
         task: Task vector.
         team: Team vector.
         out: (layout.size,) float32.
     """
-    k = int(row[STEP])
-    at = encode_vehicle(row, seen, disturbance, task, out)
+    j = i % LANES
+    k = int(w[STEP + j])
+    x, yaw = measured(w, j, noise)
+    at = encode_vehicle(w, j, x, yaw, disturbance, task, out)
     leads = i == 0 and team[HAS_LEADER] > 0.0
     out[at] = 1.0 if leads else 0.0
     at += 1
@@ -321,10 +320,10 @@ def observe_agent(
     K = messages.shape[0]
     at += K * (N_COMM + N_PLAN_STAGE * int(team[PLAN_STAGES]))
     for s in range(which.shape[0]):
-        j = int(which[s]) if s < sensed else i  # relative to itself an empty slot is zero
+        other = int(which[s]) if s < sensed else i  # relative to itself an empty slot is zero
         out[at] = 1.0 if s < sensed else 0.0
         for c in range(6):
-            out[at + 1 + c] = motions[j, c] - motions[i, c]
+            out[at + 1 + c] = motions[other, c] - motions[i, c]
         at += N_SENSED
     if team[SENSOR_ROWS] > 0.0:
         _encode_measurements(k, messages, measurement, team, out, at)

@@ -1,44 +1,57 @@
-"""The compiled step of the multi-agent tasks: actions in, observations and rewards out, for many teams.
+"""The compiled step of the multi-agent tasks: actions in, observations and scores out, for many teams.
 
-A vehicle is a row as in `kernel`, a team is N rows in succession. The single environment is a batch of one
-team, so that it and the batched form are the same computation.
+A team is blocks of four vehicles (`quad_envs.lanes`), the last of which may have empty lanes. The single
+environment is a batch of one team, so that it and the batched form are the same computation.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..._numba import Int, inline_kernel, kernel
-from ...dynamics import LANES, SCRATCH_ROWS, advance, load_vehicle, store_vehicle
-from ...observations.team import N_PLAN_STAGE
-from ...parameters import Array
-from ...turning import N_TABLE
-from ..tracking.kernel import (
-    BLOCK_FROM,
-    CLIPPED,
-    COEFFICIENTS,
-    COMMAND,
-    DT,
-    EPISODE_COST,
-    FORCE_MAX,
-    STEP,
-    SUBSTEPS,
-    apply_action,
-    measure_plant,
-)
-from .exchange import (
+from ..._intrinsics import borrowed, take_nearer
+from ..._numba import Int, inline_kernel, kernel, lane_kernel
+from ...dynamics import arrive, set_out
+from ...lanes import (
+    ACTION,
     ALIVE,
+    CAUSE,
+    CLIPPED,
+    CRASHED,
+    EPISODE_COST,
+    HEARD,
+    LANES,
+    LEFT,
+    MEASURES,
+    MOVED,
+    N_PLANT,
+    NEAREST,
+    PLANT,
+    REWARD,
+    SINES,
+    SLOT_ERROR,
+    STEP,
+    TERMINATED,
+    TERMS,
+    TRUNCATED,
+    VALUES,
+    VIOLATED,
+    six,
+    twelve,
+)
+from ...observations.team import N_PLAN_STAGE
+from ...plant import N_INPUT, Array
+from ..shared.plan import IntArray, floats_1, floats_2, floats_3, floats_4, integers_1, integers_2
+from ..shared.task_vector import DT, HOVER, SUBSTEPS
+from ..tracking.kernel import begin_lane, command, first_unsound, substep
+from .exchange import (
     DISTURBANCE,
     DRAW,
-    HEARD,
-    LEFT,
     MEASUREMENT,
-    MEASURES,
     N_MOTION,
-    NEAREST,
     NOISE,
     ON_RAILS,
     PLAN,
@@ -47,329 +60,405 @@ from .exchange import (
     SENSOR_ROWS,
     TARGET,
     WEIGHT,
-    IntArray,
     Tables,
     hear,
     measure_target,
     motion,
     observe_agent,
     sense,
+    told_motion,
 )
-from .scores import judge_estimate, judge_team
+from .scores import N_LOSS, judge_estimate, judge_team
 
 PLAN_SCALE = 5.0  # m, and m/s: of the plan in an action, relative to the sender
 ESTIMATE_REACH = 20.0  # m: of an estimated position in an action, relative to the vehicle
 ESTIMATE_SPEED = 5.0  # m/s: of an estimated velocity in an action
+_FAR = 1e9  # m, where those are who crashed
+_POINT = 4 * LANES  # numbers of four places and their smallest squared distances, see `take_nearer`
+
+# Rows of what a step tells of n vehicles, (.., n) float64: numbers, counts as int64, flags as bytes, then the
+# constraint values, (n, number of constraints), and terms of the reward, (n, N_LOSS + number of constraints).
+SCORES = (
+    4  # the block's rows from REWARD to EPISODE_COST; the slot error and the distance to the nearest follow
+)
+COUNTS = SCORES + 2  # clipped actions, cause of the crash, messages
+FLAGS = COUNTS + 3  # crashed, truncated, violated, terminated, alive
+N_TOLD = FLAGS + 1
+
+
+class Teams(NamedTuple):
+    """What many teams consist of, in the order of their plan."""
+
+    blocks: Array  # (teams * blocks of a team + 1, N_TEAM); the last one is for vehicles set aside
+    messages: Array  # what each vehicle heard, (n, K, HEAD + C)
+    history: Array  # contents of the last steps, (teams, depth, N, C)
+    tables: Tables
+    task: Array  # task vector
+    team: Array  # team vector
+    scratch: Array  # (scratch_size,)
+
+
+class Told(NamedTuple):
+    """The rows of what a step tells, see N_TOLD."""
+
+    numbers: Array  # (COUNTS, n)
+    counts: IntArray  # (FLAGS - COUNTS, n)
+    flags: NDArray[np.uint8]  # (8 n,), of which 5 n are used
+    values: Array  # (n, number of constraints)
+    terms: Array  # (n, N_LOSS + number of constraints)
 
 
 def scratch_size(vehicles: int, sensed: int) -> int:
-    """Numbers that `step_teams` and `begin_team` need as scratch."""
-    room = max(vehicles, LANES)
-    integrator = -(-room // LANES) * SCRATCH_ROWS * LANES
-    return 8 * room + N_TABLE + max(integrator, (16 + 2 * N_MOTION) * vehicles + 2 * sensed)
+    """Numbers that a team needs as scratch: places, motions, what is told, places again, who is near."""
+    return -(-vehicles // LANES) * _POINT + (2 * N_MOTION + 3) * vehicles + 2 * sensed + 6
+
+
+@inline_kernel
+def _teams(plan: IntArray) -> Teams:
+    return Teams(
+        floats_2(plan, np.int64(0)),
+        floats_3(plan, np.int64(1)),
+        floats_4(plan, np.int64(2)),
+        Tables(
+            floats_3(plan, np.int64(3)),
+            integers_2(plan, np.int64(4)),
+            integers_1(plan, np.int64(5)),
+            floats_3(plan, np.int64(6)),
+            integers_2(plan, np.int64(7)),
+            floats_3(plan, np.int64(8)),
+            floats_4(plan, np.int64(9)),
+            floats_3(plan, np.int64(10)),
+            floats_3(plan, np.int64(11)),
+            floats_4(plan, np.int64(12)),
+        ),
+        floats_1(plan, np.int64(13)),
+        floats_1(plan, np.int64(14)),
+        floats_1(plan, np.int64(15)),
+    )
+
+
+@inline_kernel
+def _told(block: Array, constraints: int) -> Told:
+    n, end = block.shape[1], N_TOLD + constraints
+    return Told(
+        block[:COUNTS],
+        block[COUNTS:FLAGS].view(np.int64),
+        block[FLAGS].view(np.uint8),
+        block[N_TOLD:end].reshape(n, constraints),
+        block[end:].reshape(n, N_LOSS + constraints),
+    )
+
+
+@inline_kernel
+def _gather(blocks: Array, row: Int, n: int, places: Array) -> None:
+    """Positions of a team, three rows of its blocks, into places; who crashed is far from everybody."""
+    for b in range(blocks.shape[0]):
+        w, at = blocks[b], b * _POINT
+        for j in range(LANES):
+            flies = (b * LANES + j < n) & (w[ALIVE + j] > 0.0)
+            for c in range(3):
+                places[at + c * LANES + j] = w[row + c * LANES + j] if flies else _FAR * (b * LANES + j + 1)
 
 
 @kernel
-def nearest_pairs(x: Array, y: Array, z: Array, nearest: Array) -> None:
-    """Take the squared distances within a team into the smallest ones so far; all arguments (N,)."""
-    for i in range(x.shape[0]):
-        xi, yi, zi = x[i], y[i], z[i]
-        x[i] = math.inf  # no vehicle is near itself; without a branch, so that the loop vectorises
-        for j in range(x.shape[0]):
-            dx, dy, dz = x[j] - xi, y[j] - yi, z[j] - zi
-            nearest[j] = min(dx * dx + dy * dy + dz * dz, nearest[j])
-        x[i] = xi
+def _take_nearest(places: Array, n: int) -> None:
+    """Take the squared distances between the places of n vehicles into the smallest ones so far."""
+    blocks = places.size // _POINT
+    for i in range(n):
+        x = i // LANES * _POINT + i % LANES
+        p = places[x], places[x + LANES], places[x + 2 * LANES]
+        places[x] = math.inf  # no vehicle is near itself
+        for b in range(blocks):
+            take_nearer(places, b * _POINT, p[0], p[1], p[2])
+        places[x] = p[0]
+
+
+@inline_kernel
+def _forget_nearest(places: Array) -> None:
+    for at in range(3 * LANES, places.size, _POINT):
+        for j in range(LANES):
+            places[at + j] = math.inf
+
+
+@inline_kernel
+def _tell_nearest(blocks: Array, places: Array) -> None:
+    """NEAREST of a team from the squared distances in `places`."""
+    for b in range(blocks.shape[0]):
+        for j in range(LANES):
+            blocks[b, NEAREST + j] = math.sqrt(places[b * _POINT + 3 * LANES + j])
 
 
 @kernel
-def _gather(rows: Array, first: int, count: int, w: Array, stride: Int, places: Array) -> None:
-    """Positions of the loaded vehicles into places (3, count); those that crashed are far from everybody."""
-    size = SCRATCH_ROWS * stride
-    for i in range(count):
-        block, lane = i // stride, i % stride
-        alive = rows[first + i, ALIVE] > 0.0
-        for c in range(3):
-            places[c, i] = w[block * size + c * stride + lane] if alive else 1e9 * (i + 1)
+def _fly(blocks: Array, first: int, tables: Tables, task: Array, places: Array) -> None:
+    """Integrate a team over a control period, and note the smallest distances at the substep ends.
 
-
-@kernel
-def _fly(
-    rows: Array, first: int, count: int, tables: Tables, task: Array, w: Array, places: Array, steps: IntArray
-) -> None:
-    """Integrate rows first..first+count-1, which are whole teams, over a control period.
-
-    Notes the smallest distance at the substep ends in NEAREST; a state that is not finite is not stored, and
-    NEAREST is nan then.
+    Args:
+        blocks: Of the team.
+        first: Its first vehicle.
+        tables: The tables.
+        task: Task vector.
+        places: Scratch, a _POINT per block.
     """
     n = tables.neighbours.shape[0]
-    substeps = int(task[SUBSTEPS])
-    h = task[DT] / substeps
-    stride = np.int64(LANES) if count >= BLOCK_FROM else np.int64(1)
-    size = SCRATCH_ROWS * stride
-    for i in range(count):
-        row = rows[first + i]
-        steps[i] = int(row[STEP])
-        places[3, i] = math.inf
-        block = w[(i // stride) * size : (i // stride + 1) * size]
-        load_vehicle(block, i % stride, stride, row, row[COMMAND], row[FORCE_MAX], row[COEFFICIENTS], h)
-    for s in range(substeps):
-        for b in range(0, count, stride):
-            block = w[(b // stride) * size : (b // stride + 1) * size]
-            lanes = min(int(stride), count - b)
-            which = tables.which[DISTURBANCE, first + b :]
-            advance(block, stride, lanes, s, s + 1, h, tables.disturbances, which, steps[b:])
-        _gather(rows, first, count, w, stride, places)
-        for t in range(0, count, n):
-            nearest_pairs(
-                places[0, t : t + n], places[1, t : t + n], places[2, t : t + n], places[3, t : t + n]
-            )
-    for i in range(count):
-        row = rows[first + i]
-        row[STEP] += 1.0
-        if row[ALIVE] > 0.0:
-            block = w[(i // stride) * size : (i // stride + 1) * size]
-            finite = store_vehicle(block, i % stride, stride, row)
-            row[NEAREST] = math.sqrt(places[3, i]) if finite else math.nan
+    _forget_nearest(places)
+    for s in range(int(task[SUBSTEPS])):
+        for b in range(blocks.shape[0]):
+            lanes, which = min(LANES, n - b * LANES), tables.which[DISTURBANCE]
+            substep(blocks[b], s, lanes, first + b * LANES, tables.disturbances, which, task)
+        _gather(blocks, np.int64(MOVED), n, places)
+        _take_nearest(places, n)
+    for b in range(blocks.shape[0]):
+        w = blocks[b]
+        for j in range(LANES):
+            if w[ALIVE + j] == 0.0:  # it lies where it crashed
+                for i in range(N_PLANT):
+                    w[MOVED + i * LANES + j] = w[PLANT + i * LANES + j]
+        arrive(w)
+    _tell_nearest(blocks, places)
 
 
 @kernel
-def _inform_team(
-    rows: Array,
-    first: int,
-    messages: Array,
-    history: Array,
-    tables: Tables,
-    task: Array,
-    team: Array,
+def _inform(
+    blocks: Array,
+    t: int,
+    teams: Teams,
     scratch: Array,
     out: NDArray[np.float32],
 ) -> None:
     """Measurements, messages and observations of a team at its present step.
 
     Args:
-        rows: All vehicles.
-        first: Row of the team's first one.
-        messages: What each vehicle of the team heard, (N, K, HEAD + C).
-        history: Contents of the team's last steps, (depth, N, C).
-        tables: The tables.
-        task: Task vector.
-        team: Team vector.
-        scratch: (36 N + 2 K_s,).
-        out: Observations of the team, (N, layout.size) float32.
+        blocks: Of the team.
+        t: Which it is.
+        teams: All teams.
+        scratch: ((2 N_MOTION + 3) N + 2 K_s,).
+        out: Observations of all vehicles, (n, layout.size) float32.
     """
+    tables, task, team, history = teams.tables, teams.task, teams.team, teams.history[t]
     n, sensed = tables.neighbours.shape[0], int(team[SENSED_SLOTS])
-    seen = scratch[: 16 * n].reshape(n, 16)
-    motions = scratch[16 * n : 26 * n].reshape(n, N_MOTION)
-    told = scratch[26 * n : 36 * n].reshape(n, N_MOTION)
-    key = scratch[36 * n : 36 * n + sensed]
-    near = scratch[36 * n + sensed : 36 * n + 2 * sensed]
-    k = int(rows[first, STEP])
+    first = t * n
+    motions = scratch[: N_MOTION * n].reshape(n, N_MOTION)
+    told = scratch[N_MOTION * n : 2 * N_MOTION * n].reshape(n, N_MOTION)
+    places = scratch[2 * N_MOTION * n : (2 * N_MOTION + 3) * n].reshape(3, n)
+    rest = scratch[(2 * N_MOTION + 3) * n :]
+    key, near = rest[:sensed], rest[sensed : 2 * sensed]
+    k = int(blocks[0, STEP])
     now = history[k % history.shape[0]]
     reference = tables.references[tables.which[REFERENCE, first]]
     target, draws = tables.targets[tables.which[TARGET, first]], tables.draws[tables.which[DRAW, first]]
     for i in range(n):
-        row = rows[first + i]
-        measure_plant(row, tables.noises[tables.which[NOISE, first + i]], seen[i])
-        motion(row, motions[i])
-        motion(seen[i], told[i])
+        w, j = blocks[i // LANES], i % LANES
+        motion(twelve(w, PLANT + j), six(w, SINES + j), motions[i])
+        told_motion(w, j, tables.noises[tables.which[NOISE, first + i]], told[i])
         for c in range(N_MOTION):
             now[i, c] = told[i, c]
+        for c in range(3):
+            places[c, i] = motions[i, c] if w[ALIVE + j] > 0.0 else _FAR
         if team[SENSOR_ROWS] > 0.0:
             aim = target[min(k, target.shape[0] - 1)]
-            measure_target(motions[i], aim, draws, k, i, row[MEASURES], team, now[i, MEASUREMENT:])
+            measure_target(motions[i], aim, draws, k, i, w[MEASURES + j], team, now[i, MEASUREMENT:])
     for i in range(n):
-        row = rows[first + i]
-        if row[LEFT] == 0.0:  # who crashes in this step still sees where
-            hear(k, i, rows, first, history, tables, team, messages[i])
-            count = sense(i, rows, first, motions, team, key, near)
+        w, j = blocks[i // LANES], i % LANES
+        messages = teams.messages[first + i]
+        if w[LEFT + j] == 0.0:  # who crashes in this step still sees where
+            hear(k, i, blocks, first, history, tables, team, messages)
+            count = sense(i, motions, places, team, key, near)
             observe_agent(
-                i, row, seen[i], told[i], now[i, MEASUREMENT:], messages[i], motions, tables.offsets[i],
-                reference, tables.disturbances[tables.which[DISTURBANCE, first + i]], count, near,
-                task, team, out[i],
+                i, w, told[i], now[i, MEASUREMENT:], messages, motions, tables.offsets[i], reference,
+                tables.disturbances[tables.which[DISTURBANCE, first + i]],
+                tables.noises[tables.which[NOISE, first + i]], count, near, task, team, out[first + i],
             )  # fmt: skip
         else:
-            row[HEARD] = 0.0
+            w[HEARD + j] = 0.0
             for c in range(out.shape[1]):
-                out[i, c] = 0.0
+                out[first + i, c] = 0.0
 
 
 @inline_kernel
-def _plan_of_action(own: Array, action: NDArray[np.floating], content: Array) -> None:
+def _tell(w: Array, j: Int, i: int, told: Told) -> None:
+    """Write the scores of vehicle i, which is in lane j."""
+    n = told.numbers.shape[1]
+    for k in range(SCORES):
+        told.numbers[k, i] = w[REWARD + k * LANES + j]
+    told.numbers[SCORES, i], told.numbers[SCORES + 1, i] = w[SLOT_ERROR + j], w[NEAREST + j]
+    told.counts[0, i], told.counts[1, i] = int(w[CLIPPED + j]), int(w[CAUSE + j])
+    told.counts[2, i] = int(w[HEARD + j])
+    told.flags[i] = w[CRASHED + j] > 0.0
+    told.flags[n + i] = w[TRUNCATED + j] > 0.0
+    told.flags[2 * n + i] = w[VIOLATED + j] > 0.0
+    told.flags[3 * n + i] = w[TERMINATED + j] > 0.0
+    told.flags[4 * n + i] = w[ALIVE + j] > 0.0
+    for k in range(told.values.shape[1]):
+        told.values[i, k] = w[VALUES + k * LANES + j]
+    for k in range(told.terms.shape[1]):
+        told.terms[i, k] = w[TERMS + k * LANES + j]
+
+
+@inline_kernel
+def _plan_of_action(w: Array, j: Int, action: NDArray[np.floating], content: Array) -> None:
     """The plan in the tail of an action, absolute, into the content of the coming message."""
-    for c in range(action.shape[0] - 4):
+    for c in range(action.shape[0] - N_INPUT):
         part = c % N_PLAN_STAGE
-        at = own[part] if part < 3 else 0.0
-        content[PLAN + c] = at + PLAN_SCALE * min(max(float(action[4 + c]), -1.0), 1.0)
+        at = w[PLANT + part * LANES + j] if part < 3 else 0.0
+        content[PLAN + c] = at + PLAN_SCALE * min(max(float(action[N_INPUT + c]), -1.0), 1.0)
 
 
-@kernel
+@inline_kernel
 def _ride(
-    rows: Array, first: int, tables: Tables, actions: NDArray[np.floating], task: Array, estimate: Array
+    blocks: Array, first: int, tables: Tables, actions: NDArray[np.floating], task: Array, estimate: Array
 ) -> None:
     """A step of vehicles on rails, which fly straight on; their actions are estimates of the target now."""
     target = tables.targets[tables.which[TARGET, first]]
     for i in range(tables.neighbours.shape[0]):
-        row = rows[first + i]
+        w, j = blocks[i // LANES], i % LANES
+        _count_clipped(w, j, actions[first + i], 0)
         for c in range(3):
-            estimate[c] = row[c] + ESTIMATE_REACH * min(max(float(actions[first + i, c]), -1.0), 1.0)
+            place = w[PLANT + c * LANES + j]
+            estimate[c] = place + ESTIMATE_REACH * min(max(float(actions[first + i, c]), -1.0), 1.0)
             estimate[3 + c] = ESTIMATE_SPEED * min(max(float(actions[first + i, 3 + c]), -1.0), 1.0)
-        k = min(int(row[STEP]), target.shape[0] - 1)
-        row[STEP] += 1.0
-        judge_estimate(row, target[k], estimate, task)
-        for c in range(3):
-            row[c] += task[DT] * row[3 + c]  # level and at heading 0, so that V_B is the inertial velocity
+        k = min(int(w[STEP + j]), target.shape[0] - 1)
+        w[STEP + j] += 1.0
+        judge_estimate(w, j, target[k], estimate, task)
+        for c in range(3):  # level and at heading 0, so that V_B is the inertial velocity
+            w[PLANT + c * LANES + j] += task[DT] * w[PLANT + (3 + c) * LANES + j]
 
 
-@kernel
-def _count_clipped(row: Array, action: NDArray[np.floating], start: int) -> None:
+@inline_kernel
+def _count_clipped(w: Array, j: Int, action: NDArray[np.floating], start: int) -> None:
     """Count the entries of an action outside [-1, 1] from `start` on."""
     for a in range(start, action.shape[0]):
         if abs(action[a]) > 1.0:
-            row[CLIPPED] += 1.0
+            w[CLIPPED + j] += 1.0
 
 
-@kernel
+@inline_kernel
+def _command_team(
+    blocks: Array, first: int, n: int, actions: NDArray[np.floating], history: Array, task: Array
+) -> None:
+    """Take over the actions of a team: rotor commands and plans."""
+    for i in range(n):
+        w, j, action = blocks[i // LANES], i % LANES, actions[first + i]
+        for a in range(N_INPUT):
+            w[ACTION + a * LANES + j] = action[a]
+        _count_clipped(w, j, action, N_INPUT)
+        coming = (int(w[STEP + j]) + 1) % history.shape[0]
+        _plan_of_action(w, j, action, history[coming, i])
+    for b in range(blocks.shape[0]):
+        command(blocks[b], task)
+
+
+@lane_kernel
 def step_teams(
-    rows: Array,
-    messages: Array,
-    history: Array,
-    weights: Array,
-    neighbours: IntArray,
-    schedule: IntArray,
-    offsets: Array,
-    which: IntArray,
-    references: Array,
-    disturbances: Array,
-    noises: Array,
-    targets: Array,
-    draws: Array,
-    flat_actions: NDArray[np.floating],
-    task: Array,
-    team: Array,
-    scratch: Array,
-    steps: IntArray,
+    plan: IntArray,
+    flat_actions: NDArray[np.float32],
     flat_out: NDArray[np.float32],
+    told_block: Array,
+    constraints: int,
 ) -> int:
     """One control period of every team.
 
     Args:
-        rows: (n, TEAM_ROW_SIZE), modified in place; a team is N rows.
-        messages: What each vehicle heard, (n, K, HEAD + C), modified in place.
-        history: Contents of the last steps, (teams, depth, N, C), modified in place.
-        weights: See `Tables`, as what follows.
-        neighbours: See `Tables`.
-        schedule: See `Tables`.
-        offsets: See `Tables`.
-        which: See `Tables`.
-        references: See `Tables`.
-        disturbances: See `Tables`.
-        noises: See `Tables`.
-        targets: See `Tables`.
-        draws: See `Tables`.
+        plan: Of the `Teams`.
         flat_actions: (n action_size,).
-        task: Task vector.
-        team: Team vector.
-        scratch: (scratch_size,).
-        steps: Scratch, (>= max(N, LANES),) int64.
-        flat_out: Observations, (n layout.size,) float32.
+        flat_out: Observations, (n layout.size,).
+        told_block: Scores of all, see N_TOLD.
+        constraints: Number of named constraints.
 
     Returns:
         -1, or the flat index of the first non-finite action; then nothing was changed.
     """
-    tables = Tables(
-        weights, neighbours, schedule, offsets, which, references, disturbances, noises, targets, draws
-    )
-    rows_in_all, n = rows.shape[0], neighbours.shape[0]
-    actions = flat_actions.reshape(rows_in_all, flat_actions.size // rows_in_all)
-    out = flat_out.reshape(rows_in_all, flat_out.size // rows_in_all)
-    for a in range(flat_actions.size):
-        if not np.isfinite(flat_actions[a]):
-            return a
-    room = max(n, LANES)
-    previous = scratch[: 4 * room].reshape(room, 4)
-    places = scratch[4 * room : 8 * room].reshape(4, room)
-    wanted = scratch[8 * room : 8 * room + N_TABLE]
-    rest = scratch[8 * room + N_TABLE :]
-    on_rails = team[ON_RAILS] > 0.0
-    group = max(1, LANES // n) * n  # rows of as many teams as fit into a block of lanes
-    for first in range(0, rows_in_all, group):
-        count = min(group, rows_in_all - first)
-        if not on_rails:
-            for i in range(count):
-                row, action = rows[first + i], actions[first + i]
-                for a in range(4):
-                    previous[i, a] = row[COMMAND][a]
-                apply_action(row, action, task)
-                _count_clipped(row, action, 4)
-                past = history[(first + i) // n]
-                _plan_of_action(row, action, past[(int(row[STEP]) + 1) % past.shape[0], (first + i) % n])
-            _fly(rows, first, count, tables, task, rest, places, steps)
-        for begin in range(first, first + count, n):
-            if on_rails:
-                for i in range(begin, begin + n):
-                    _count_clipped(rows[i], actions[i], 0)
-                _ride(rows, begin, tables, actions, task, wanted)
-            else:
-                judge_team(rows, begin, tables, previous[begin - first :], wanted, task, team)
-            _inform_team(
-                rows, begin, messages[begin : begin + n], history[begin // n], tables, task, team,
-                rest, out[begin : begin + n],
-            )  # fmt: skip
+    bad = first_unsound(flat_actions)
+    if bad >= 0:
+        return bad
+    teams, told, all_ = _teams(plan), _told(borrowed(told_block), constraints), told_block.shape[1]
+    actions = borrowed(flat_actions).reshape(all_, flat_actions.size // all_)
+    out = borrowed(flat_out).reshape(all_, flat_out.size // all_)
+    tables, task, team = teams.tables, teams.task, teams.team
+    n = tables.neighbours.shape[0]
+    each = (teams.blocks.shape[0] - 1) // (all_ // n)
+    aside = teams.blocks[teams.blocks.shape[0] - 1]
+    places, rest = teams.scratch[: each * _POINT], teams.scratch[each * _POINT :]
+    for t in range(all_ // n):
+        blocks, first = teams.blocks[t * each : (t + 1) * each], t * n
+        if team[ON_RAILS] > 0.0:
+            _ride(blocks, first, tables, actions, task, rest)
+        else:
+            _command_team(blocks, first, n, actions, teams.history[t], task)
+            _fly(blocks, first, tables, task, places)
+            judge_team(blocks, first, aside, tables, task, team)
+        _inform(blocks, t, teams, rest, out)
+        for i in range(n):
+            _tell(blocks[i // LANES], i % LANES, first + i, told)
     return -1
 
 
 @kernel
-def begin_team(
-    begin: int,
-    rows: Array,
-    messages: Array,
-    history: Array,
-    weights: Array,
-    neighbours: IntArray,
-    schedule: IntArray,
-    offsets: Array,
-    which: IntArray,
-    references: Array,
-    disturbances: Array,
-    noises: Array,
-    targets: Array,
-    draws: Array,
-    task: Array,
-    team: Array,
-    scratch: Array,
-    out: NDArray[np.float32],
+def begin_teams(
+    plan: IntArray,
+    index: IntArray,
+    plants: Array,
+    flat_out: NDArray[np.float32],
+    told_block: Array,
+    constraints: int,
 ) -> None:
-    """Scores and observations of the team at rows begin.. after a reset; other arguments as in `step_teams`.
+    """Begin episodes; until a vehicle has sent a plan, its neighbours are told that it goes straight on.
 
-    Until a vehicle has sent a plan, its neighbours are told that it goes on at its velocity.
+    Args:
+        plan: Of the `Teams`.
+        index: Teams, (m,).
+        plants: Where their vehicles start, (m, N, 16).
+        flat_out: As in `step_teams`.
+        told_block: As in `step_teams`.
+        constraints: As in `step_teams`.
     """
-    tables = Tables(
-        weights, neighbours, schedule, offsets, which, references, disturbances, noises, targets, draws
-    )
-    n = neighbours.shape[0]
-    room = max(n, LANES)
-    places, wanted = scratch[4 * room : 8 * room].reshape(4, room), scratch[8 * room : 8 * room + N_TABLE]
-    rest = scratch[8 * room + N_TABLE :]
-    past = history[begin // n]
-    for i in range(n):
-        row = rows[begin + i]
-        row[ALIVE] = 1.0
-        places[0, i], places[1, i], places[2, i], places[3, i] = row[0], row[1], row[2], math.inf
-        for s in range(messages.shape[1]):
-            messages[begin + i, s, WEIGHT] = 0.0
-        motion(row, past[0, i])
-        for c in range(past.shape[2] - PLAN):
-            q, part = c // N_PLAN_STAGE, c % N_PLAN_STAGE
-            ahead = q * task[DT] * past[0, i, 3 + part] if part < 3 else 0.0
-            past[0, i, PLAN + c] = past[0, i, part] + ahead
-    nearest_pairs(places[0, :n], places[1, :n], places[2, :n], places[3, :n])
-    for i in range(n):
-        rows[begin + i, NEAREST] = math.sqrt(places[3, i])
-    if team[ON_RAILS] == 0.0:
+    teams, told, all_ = _teams(plan), _told(borrowed(told_block), constraints), told_block.shape[1]
+    out = borrowed(flat_out).reshape(all_, flat_out.size // all_)
+    tables, task, team = teams.tables, teams.task, teams.team
+    n = tables.neighbours.shape[0]
+    each = (teams.blocks.shape[0] - 1) // (all_ // n)
+    aside = teams.blocks[teams.blocks.shape[0] - 1]
+    places, rest = teams.scratch[: each * _POINT], teams.scratch[each * _POINT :]
+    for m in range(index.size):
+        t = index[m]
+        blocks, first = teams.blocks[t * each : (t + 1) * each], t * n
         for i in range(n):
-            for a in range(4):
-                scratch[4 * i + a] = rows[begin + i, COMMAND][a]
-        judge_team(rows, begin, tables, scratch[: 4 * n].reshape(n, 4), wanted, task, team)
+            w, j = blocks[i // LANES], i % LANES
+            _clear(w, j)
+            begin_lane(w, j, plants[m, i], task[HOVER])
+            for s in range(teams.messages.shape[1]):
+                teams.messages[first + i, s, WEIGHT] = 0.0
+        _forget_nearest(places)
+        _gather(blocks, np.int64(PLANT), n, places)
+        _take_nearest(places, n)
+        _tell_nearest(blocks, places)
+        for b in range(each):
+            set_out(blocks[b])
+        if team[ON_RAILS] == 0.0:
+            judge_team(blocks, first, aside, tables, task, team)
         for i in range(n):
-            rows[begin + i, EPISODE_COST] = 0.0
-    _inform_team(rows, begin, messages[begin : begin + n], past, tables, task, team, rest, out)
+            blocks[i // LANES, EPISODE_COST + i % LANES] = 0.0
+            _promise(blocks[i // LANES], i % LANES, task[DT], teams.history[t, 0, i])
+        _inform(blocks, t, teams, rest, out)
+        for i in range(n):
+            _tell(blocks[i // LANES], i % LANES, first + i, told)
+
+
+@inline_kernel
+def _clear(w: Array, j: Int) -> None:
+    """Forget the scores of an episode; which vehicle it is, and whether it has the sensor, stays."""
+    for row in range(REWARD, ACTION, LANES):
+        w[row + j] = 0.0
+    for row in range(TERMS, LEFT + LANES, LANES):
+        if row != MEASURES:
+            w[row + j] = 0.0
+    w[ALIVE + j] = 1.0
+
+
+@inline_kernel
+def _promise(w: Array, j: Int, dt: float, content: Array) -> None:
+    """The plan before any was sent: on at the present velocity."""
+    motion(twelve(w, PLANT + j), six(w, SINES + j), content)
+    for c in range(content.shape[0] - PLAN):
+        stage, part = c // N_PLAN_STAGE, c % N_PLAN_STAGE
+        ahead = stage * dt * content[3 + part] if part < 3 else 0.0
+        content[PLAN + c] = content[part] + ahead

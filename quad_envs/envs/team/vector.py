@@ -13,14 +13,13 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from ...checks import require_whole
-from ...parameters import Array
+from ...lanes import N_PLANT, PLANT
+from ...plant import Array
 from ...tasks import TeamTask
-from ..shared.vector_parts import Generators, score_infos, seeded, with_presence
-from ..tracking.kernel import PLANT, REWARD, TRUNCATED
+from ..shared.vector_parts import Generators, presence, seeded
 from .batch import TeamBatch
-from .exchange import ALIVE, HEARD, NEAREST, SLOT_ERROR, TERMINATED, TERMS
 from .options import TeamOptions
-from .scores import N_LOSS
+from .told import TeamScores
 
 Observations = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -63,9 +62,12 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self._masks: dict[str, Bools] = {}
         self._generators: Generators = []
         self._done: Bools = np.zeros(self.num_teams, dtype=np.bool_)
-        self._seen = np.zeros((self.num_envs, size), dtype=np.float32)  # for teams that a reset leaves alone
+        # What was told last, for teams that a reset leaves alone.
+        self._seen = np.zeros((self.num_envs, size), dtype=np.float32)
+        self._told = np.zeros_like(self._batch.fresh_scores())
 
     @property
     def task(self) -> TeamTask:
@@ -75,7 +77,7 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
     @property
     def plants(self) -> Array:
         """Copy of the plants [p, V_B, Theta, Omega, F], (n N, 16). For study and tests."""
-        return self._batch.rows[:, PLANT].copy()
+        return self._batch.vehicles.read(PLANT, N_PLANT)
 
     @property
     def references(self) -> Array:
@@ -104,12 +106,11 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
         given = dict(options or {})
         mask = self._team_mask(given.pop("reset_mask", None))
         self._generators = seeded(self._generators, seed, mask)
-        observations = self._seen.copy()
-        for t in np.flatnonzero(mask).tolist():
-            self._reset_team(t, observations, given)
+        observations, told = self._seen.copy(), self._told.copy()
+        self._begin(np.flatnonzero(mask), observations, told, given)
         self._done[mask] = False
-        self._seen = observations.copy()
-        return observations, self._info()
+        self._seen, self._told = observations.copy(), told.copy()
+        return observations, self._info(self._batch.scores(told))
 
     def _team_mask(self, mask: Any) -> Bools:
         """Which teams a reset begins anew, (n,)."""
@@ -136,36 +137,51 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
             raise ValueError(f"actions must have shape {self.action_space.shape}, got {actions.shape}")
         if not self._generators:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        anew = self._done if self.autoreset_mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._done)
-        begins = np.repeat(anew, self.task.vehicles)
-        if anew.any():
+        again = self.autoreset_mode is AutoresetMode.NEXT_STEP and bool(self._done.any())
+        if again:
+            begins = np.repeat(self._done, self.task.vehicles)
             actions = np.where(begins[:, None], np.float32(0.0), actions)
-        observations = self._fresh_observations()
-        self._batch.step(actions, observations)
-        for t in np.flatnonzero(anew).tolist():
-            self._reset_team(t, observations, None)
-        rows = self._batch.rows
-        rewards = np.where(begins, 0.0, rows[:, REWARD])
-        terminated = rows[:, TERMINATED] > 0.0
-        truncated = (rows[:, TRUNCATED] > 0.0) & ~terminated
-        self._done = np.asarray((terminated | truncated).reshape(self.num_teams, -1).all(axis=1))
-        self._seen = observations
-        return observations, rewards, terminated, truncated, self._info()
+        observations, told = self._fresh_observations(), self._batch.fresh_scores()
+        self._batch.step(actions.reshape(-1), observations.reshape(-1), told)
+        if again:
+            self._begin(np.flatnonzero(self._done), observations, told)
+        scores = self._batch.scores(told)
+        if again:
+            scores.reward[begins] = 0.0
+        truncated = scores.truncated & ~scores.terminated
+        self._done = np.asarray((scores.terminated | truncated).reshape(self.num_teams, -1).all(axis=1))
+        self._seen, self._told = observations, told
+        return observations, scores.reward, scores.terminated.copy(), truncated, self._info(scores)
 
-    def _reset_team(self, t: int, observations: Observations, options: dict[str, Any] | None) -> None:
-        n = self.task.vehicles
-        self._batch.reset_team(t, self._generators[t], observations[t * n : (t + 1) * n], options)
+    def _begin(
+        self,
+        index: NDArray[np.int64],
+        observations: Observations,
+        told: Array,
+        options: dict[str, Any] | None = None,
+    ) -> None:
+        generators = [self._generators[t] for t in index.tolist()]
+        self._batch.begin(index, generators, observations.reshape(-1), told, options)
 
     def _fresh_observations(self) -> Observations:
         return np.empty((self.num_envs, self.task.layout.size), dtype=np.float32)
 
-    def _info(self) -> dict[str, Any]:
-        rows, n = self._batch.rows, len(self.task.constraint_names)
-        info = score_infos(rows, n) | {
-            "formation_error": rows[:, SLOT_ERROR].copy(),
-            "min_separation": rows[:, NEAREST].copy(),
-            "messages": rows[:, HEARD].astype(np.int64),
-            "reward_terms": rows[:, TERMS : TERMS + N_LOSS + n].copy(),
-            "alive": rows[:, ALIVE] > 0.0,
+    def _info(self, scores: TeamScores) -> dict[str, Any]:
+        info = {
+            "cost": scores.cost,
+            "episode_cost": scores.episode_cost,
+            "constraint_violation": scores.violated,
+            "constraint_values": scores.values,
+            "stage_cost": scores.stage_cost,
+            "crashed": scores.crashed,
+            "crash_cause": scores.cause,
+            "clipped_actions": scores.clipped,
+            "formation_error": scores.slot_error,
+            "min_separation": scores.nearest,
+            "messages": scores.heard,
+            "reward_terms": scores.terms,
+            "alive": scores.alive,
         }
-        return with_presence(info, self.num_envs)
+        if not self._masks:
+            self._masks = presence(self.num_envs, info)
+        return info | self._masks

@@ -15,7 +15,7 @@ from ...constraints import TOLERANCE
 from ...parameters import N_STATE, Array
 from ...reward import stage_cost_kernel
 from ...rotations import sincos, wrap_angle_scalar
-from .kernel import (
+from ..shared.task_vector import (
     ACTION_MAX,
     DT,
     FIRST,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,36 +11,32 @@ from numpy.typing import NDArray
 from ..._numba import entry_of
 from ...checks import array_bytes, require_memory
 from ...disturbances import Disturbance
+from ...lanes import COEFFICIENTS, DECAY, FORCE_MAX, LANES, N_PLANT, N_TRACKING, Blocks
 from ...names import shown
-from ...parameters import N_STATE, POSITION, Array
+from ...parameters import ROTOR_RATE
+from ...plant import N_STATE, POSITION, Array
 from ...references import Reference, make_reference, state_on
-from ...turning import N_TABLE
+from ...table_row import N_TABLE
 from ..shared.given import given_plants
+from ..shared.plan import IntArray, make_plan
 from ..shared.tables import disturbance_rows, draw_vehicle, reference_rows, stage_times
-from .kernel import (
-    COEFFICIENTS,
-    COMMAND,
-    FORCE_MAX,
-    PLANT,
-    ROW_SIZE,
-    SCRATCH_SIZE,
-    begin_row,
-    observe_row,
-    step_rows,
-    task_vector,
-)
+from ..shared.task_vector import task_vector
+from ..shared.workers import Workers
+from .kernel import N_TOLD, Flights, begin_flights, step_flights, tell_flights
 from .options import TrackingOptions
+from .scores import Scores, scores_of
 
-_step = entry_of(step_rows)
+_step, _begin, _tell = entry_of(step_flights), entry_of(begin_flights), entry_of(tell_flights)
+Generators = Sequence[np.random.Generator]
 
 
 class TrackingBatch:
     """n independent flights of one task.
 
-    The public arrays are views for reading; `reset_row` and `step` change them.
+    The public arrays are views for reading; `begin` and `step` change them.
     """
 
-    def __init__(self, options: TrackingOptions, n: int) -> None:
+    def __init__(self, options: TrackingOptions, n: int, threads: int = 1) -> None:
         self.options, self.n, self.task = options, n, options.task
         self._reference: Reference = make_reference(options.reference)
         self._disturbance: Disturbance | None = options.make_disturbance()
@@ -59,11 +55,10 @@ class TrackingBatch:
         seen = (n, self.task.layout.size)
         require_memory(
             f"{shown(n)} flights of {steps} steps",
-            array_bytes((n, ROW_SIZE), references, disturbances, noises, (steps, nodes), seen),
+            array_bytes((n, N_TRACKING // LANES), references, disturbances, noises, (steps, nodes), seen),
             "choose fewer of them, shorter ones, a shorter preview, or fewer substeps",
         )
-        self.rows: Array = np.zeros((n, ROW_SIZE))
-        self._vector = task_vector(self.task, options.substeps, options.lost_distance)
+        self.vehicles = Blocks(n, N_TRACKING)
         self._randomization = options.randomization()
         self._start, self._widths = options.start_state(), options.start_half_widths()
         self._times: Array = dt * np.arange(references[1], dtype=np.float64)
@@ -83,39 +78,82 @@ class TrackingBatch:
         for table in range(3):
             if random[table]:
                 self.which[table] = np.arange(n)
-        self._scratch = np.zeros(SCRATCH_SIZE)
-        # What the step kernel takes before the actions and between them and the observations.
-        self._before = (self.rows, self.references, self.disturbances, self.noises, self.which)
-        self._after = (self._vector, self._scratch, np.zeros(n, dtype=np.int64))
+        self._place(*draw_vehicle(self.task, {}, never))
+        self._arrays = Flights(
+            self.vehicles.array,
+            self.references,
+            self.disturbances,
+            self.noises,
+            self.which,
+            task_vector(self.task, options.substeps, options.lost_distance),
+        )
+        self._told_shape = N_TOLD + len(self.task.constraint_names), n
+        self._plan = make_plan(self._arrays)
+        self._workers = Workers(min(threads, self.vehicles.count))
 
-    def reset_row(
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in self.__dict__.items() if key != "_plan"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._plan = make_plan(self._arrays)
+
+    def fresh_scores(self) -> Array:
+        """Where `begin`, `step` and `tell` write their scores, see `kernel.N_TOLD`."""
+        return np.empty(self._told_shape)
+
+    def scores(self, told: Array) -> Scores:
+        """What is told there."""
+        return scores_of(told)
+
+    def begin(
         self,
-        i: int,
-        rng: np.random.Generator,
+        index: IntArray,
+        generators: Generators,
         out: NDArray[np.float32],
-        options: Mapping[str, Any] | None = None,
+        told: Array,
+        states: Array | None = None,
     ) -> None:
-        """Begin a new episode in row i and write its first observation.
+        """Begin new episodes, and write their first observations and scores.
 
-        Draws, in this order: start (12 uniform numbers), vehicle, reference, disturbance, sensor noise.
+        Draws for each flight, in this order: start (12 uniform numbers), vehicle, reference, disturbance,
+        sensor noise.
 
         Args:
-            i: Row.
-            rng: The generator of this flight.
-            out: Observation, (layout.size,) float32.
-            options: `{"state": ...}` puts the plant (12 or 16 numbers) there instead of the drawn start.
+            index: Flights, (m,).
+            generators: Theirs, m.
+            out: Observations, (n layout.size,) float32.
+            told: Scores, of `fresh_scores`.
+            states: Plants (m, 16) instead of the drawn starts.
 
         Raises:
-            ValueError: If the options are unknown or the state is not a finite plant.
+            ValueError: If a start is lost already.
         """
-        start = None if not options else self._start_from(options)
-        state = self._start + self._widths * rng.uniform(-1.0, 1.0, N_STATE)
-        vehicle, force_max = draw_vehicle(self.task, self._randomization, rng)
-        row = self.rows[i]
-        row[:] = 0.0
-        row[PLANT] = [*state, *[self.task.hover_force] * 4] if start is None else start
-        row[COMMAND] = self.task.hover_force
-        row[COEFFICIENTS], row[FORCE_MAX] = vehicle, force_max
+        draws = np.empty((len(index), N_STATE))
+        varied = bool(self._randomization) or any(self._random)
+        for draw, i, rng in zip(draws, index.tolist(), generators, strict=True):
+            rng.random(out=draw)
+            if varied:
+                self._draw(i, rng)
+        if states is None:
+            plants = np.full((len(index), N_PLANT), self.task.hover_force)
+            plants[:, :N_STATE] = self._start + self._widths * (2.0 * draws - 1.0)
+            if self.options.starts_on_reference:
+                plants[:, :N_STATE] += [state_on(self.reference(i)[0]) for i in index.tolist()]
+        else:
+            plants = np.ascontiguousarray(states)
+        lost = _begin(self._plan, index, plants, out, told)
+        if lost >= 0:
+            off = plants[lost, POSITION] - self.reference(int(index[lost]))[0, POSITION]
+            raise ValueError(
+                f"the start is {float(np.linalg.norm(off)):.3g} m from the reference, beyond lost_distance = "
+                f"{self.options.lost_distance:g} m; move the start or the reference, or raise lost_distance"
+            )
+
+    def _draw(self, i: int, rng: np.random.Generator) -> None:
+        """What else is drawn for flight i."""
+        if self._randomization:
+            self._place(*draw_vehicle(self.task, self._randomization, rng), i)
         if self._random[0]:
             self.references[i] = reference_rows(self._reference, self._times, rng)
         if self._disturbance is not None and self._random[1]:
@@ -123,54 +161,57 @@ class TrackingBatch:
         if self._random[2]:
             rng.standard_normal(out=self.noises[i])
             self.noises[i] *= self._noise
-        if self.options.starts_on_reference and start is None:
-            row[:N_STATE] += state_on(self.reference(i)[0])
-        distance = float(np.linalg.norm(row[POSITION] - self.references[self.which[0, i], 0, POSITION]))
-        if distance > self.options.lost_distance:
-            raise ValueError(
-                f"the start is {distance:.3g} m from the reference, beyond lost_distance = "
-                f"{self.options.lost_distance:g} m; move the start or the reference, or raise lost_distance"
-            )
-        begin_row(self.rows, i, self.references[self.which[0, i]], self._vector)
-        self.observe(i, out)
 
-    def observe(self, i: int, out: NDArray[np.float32]) -> None:
-        """Write the present observation of row i, (layout.size,) float32."""
-        observe_row(
-            self.rows,
-            i,
-            self.references,
-            self.disturbances,
-            self.noises,
-            self.which,
-            self._vector,
-            self._scratch,
-            out,
-        )
+    def _place(self, vehicle: Array, force_max: Array, i: int | None = None) -> None:
+        """Which vehicle flies in flight i, or in all: coefficients, and the largest force of each rotor."""
+        half = 0.5 * self.task.dt / self.options.substeps
+        self.vehicles.write(COEFFICIENTS, vehicle, i)
+        self.vehicles.write(FORCE_MAX, force_max, i)
+        self.vehicles.write(DECAY, np.exp(-half * vehicle[ROTOR_RATE : ROTOR_RATE + 1]), i)
+
+    def tell(self, index: IntArray, out: NDArray[np.float32], told: Array) -> None:
+        """Write observations and scores of flights as they are; arguments as in `begin`."""
+        _tell(self._plan, index, out, told)
 
     def reference(self, i: int) -> Array:
-        """Reference rows of flight i in its present episode, a view, (n_steps, 9)."""
+        """Reference rows of flight i in its present episode, a view, (n_steps, N_TABLE)."""
         return np.asarray(self.references[self.which[0, i]])
 
-    def step(self, actions: NDArray[np.floating], out: NDArray[np.float32]) -> None:
-        """Move all flights by one control period and write their observations.
+    def step(self, actions: NDArray[np.float32], out: NDArray[np.float32], told: Array) -> int:
+        """Move all flights by one control period, and write their observations and scores.
 
         Args:
-            actions: (n, 4) or, for one flight, (4,), contiguous; clipped to [-1, 1], which is counted.
-            out: (n, layout.size) or (layout.size,), float32.
+            actions: (4 n,), contiguous; clipped to [-1, 1], which is counted.
+            out: Observations, (n layout.size,).
+            told: Scores, of `fresh_scores`.
+
+        Returns:
+            Number of episodes that ended.
 
         Raises:
             ValueError: If an action is not finite; then no flight has moved.
         """
-        bad = _step(*self._before, actions.reshape(-1), *self._after, out.reshape(-1))
-        if bad >= 0:
+        if self._workers.threads == 1:
+            ended = _step(self._plan, actions, out, told, 0, self.vehicles.count)
+        else:
+            ended = self._workers.run(_step, self.vehicles.count, self._plan, actions, out, told)
+        if ended < 0:
+            bad = -1 - ended
             where = f"[{bad}]" if self.n == 1 else f"[{bad // 4}, {bad % 4}]"
             raise ValueError(
-                f"action{where} is {actions.reshape(-1)[bad]}; actions must be finite numbers in [-1, 1]. "
+                f"action{where} is {actions[bad]}; actions must be finite numbers in [-1, 1]. "
                 "The environment has not moved."
             )
+        return ended
 
-    def _start_from(self, options: Mapping[str, Any]) -> Array:
+    def given_states(self, options: Mapping[str, Any] | None) -> Array | None:
+        """The plant (16,) of the reset options, if there is one.
+
+        Raises:
+            ValueError: If an option is unknown, or the state is not a finite plant.
+        """
+        if not options:
+            return None
         unknown = sorted(set(options) - {"state"})
         if unknown:
             raise ValueError(f"unknown reset option {unknown[0]!r}; known: 'state' (12 or 16 numbers)")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from struct import Struct
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -10,13 +11,14 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ...episode_limit import steps_asked
-from ...observations.tracking import N_REFERENCE
-from ...parameters import Array
+from ...lanes import N_PLANT, PLANT
+from ...plant import Array
+from ...table_row import N_REFERENCE
 from ...tasks import Task
 from ..shared.render_modes import NO_RENDERING, RenderModes, checked_rendering
 from ..shared.specified import Specified
 from .batch import TrackingBatch
-from .kernel import CAUSE, PLANT, SCORES, VALUES
+from .kernel import N_TOLD
 from .options import TrackingOptions
 
 if TYPE_CHECKING:
@@ -24,9 +26,10 @@ if TYPE_CHECKING:
 
 Observation = NDArray[np.float32]
 
-# Entries of SCORES.
-_REWARD, _STAGE_COST, _COST, _EPISODE_COST, _VIOLATED, _CRASHED, _TRUNCATED, _CLIPPED = range(8)
-_CAUSE = CAUSE - SCORES.start
+# What the kernel tells of a single flight, see `kernel.N_TOLD`: reward, stage cost, cost, episode cost;
+# clipped actions, cause; crashed, truncated, violated.
+_unpack = Struct("4d2q3?5x").unpack_from
+_ONE = np.zeros(1, dtype=np.int64)
 
 
 class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -96,6 +99,8 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
         self, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480), **kwargs: Any
     ) -> None:
         size = checked_rendering(render_mode, ("rgb_array",), render_size)
+        if "threads" in kwargs:
+            raise TypeError("one flight has nothing to share: threads is an argument of gymnasium.make_vec")
         asked = steps_asked()
         if asked is not None:
             kwargs["max_episode_steps"] = asked
@@ -106,24 +111,10 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
             from ..pictures import TrackingPictures  # not needed by who trains and measures
 
             self._pictures = TrackingPictures(self._batch, 0, size)
-        self._bind()
+        self._size = self.task.layout.size
+        self._told = self._batch.fresh_scores()
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.observation_space = spaces.Box(-np.inf, np.inf, (self._size,), np.float32)
-
-    def _bind(self) -> None:
-        """Views of the batch's only row, made once because slicing takes longer than reading."""
-        row = self._batch.rows[0]
-        self._scores, self._plant = row[SCORES], row[PLANT]
-        self._values = row[VALUES : VALUES + len(self.task.constraint_names)]
-        self._size = self.task.layout.size
-
-    def __getstate__(self) -> dict[str, Any]:
-        views = ("_scores", "_plant", "_values", "_size")
-        return {key: value for key, value in self.__dict__.items() if key not in views}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._bind()
 
     @property
     def options(self) -> TrackingOptions:
@@ -138,7 +129,7 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
     @property
     def state(self) -> Array:
         """Copy of the plant [p, V_B, Theta, Omega, F], (16,), for study and tests; policies never see it."""
-        return np.array(self._plant)
+        return np.asarray(self._batch.vehicles.read(PLANT, N_PLANT)[0])
 
     @property
     def reference(self) -> Array:
@@ -150,31 +141,26 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode; `options={"state": x}` with 12 or 16 numbers sets the plant."""
         super().reset(seed=seed)
-        observation = np.empty(self._size, dtype=np.float32)
-        self._batch.reset_row(0, self.np_random, observation, options)
+        observation = np.empty(self._size, np.float32)
+        state = self._batch.given_states(options)
+        states = None if state is None else state[None]
+        self._batch.begin(_ONE, [self.np_random], observation, self._told, states)
         if self._pictures:
             self._pictures.record()
-        return observation, self._info(self._scores.tolist())
+        return observation, self._answer()[-1]
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Hold the rotor commands over one control period."""
         if self._np_random is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        actions = np.ascontiguousarray(action, dtype=np.float32)
+        actions = np.ascontiguousarray(action, np.float32)
         if actions.shape != (4,):
             raise ValueError(f"action must have shape (4,), one entry per rotor, got {actions.shape}")
-        observation = np.empty(self._size, dtype=np.float32)
-        self._batch.step(actions, observation)
+        observation = np.empty(self._size, np.float32)
+        self._batch.step(actions, observation, self._told)
         if self._pictures:
             self._pictures.record()
-        scores = self._scores.tolist()
-        return (
-            observation,
-            scores[_REWARD],
-            scores[_CRASHED] > 0.0,
-            scores[_TRUNCATED] > 0.0,
-            self._info(scores),
-        )
+        return (observation, *self._answer())
 
     def render(self) -> NDArray[np.uint8] | None:
         """The picture of the present moment, (height, width, 3), with `render_mode="rgb_array"`."""
@@ -183,14 +169,17 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
             return None
         return self._pictures.frame()
 
-    def _info(self, scores: list[float]) -> dict[str, Any]:
-        return {
-            "cost": scores[_COST],
-            "episode_cost": scores[_EPISODE_COST],
-            "constraint_violation": scores[_VIOLATED] > 0.0,
-            "constraint_values": self._values.copy(),
-            "stage_cost": scores[_STAGE_COST],
-            "crashed": scores[_CRASHED] > 0.0,
-            "crash_cause": int(scores[_CAUSE]),
-            "clipped_actions": int(scores[_CLIPPED]),
+    def _answer(self) -> tuple[float, bool, bool, dict[str, Any]]:
+        """Reward, terminated, truncated and info of what the kernel told."""
+        reward, loss, cost, total, clipped, cause, crashed, truncated, violated = _unpack(self._told.data)
+        info = {
+            "cost": cost,
+            "episode_cost": total,
+            "constraint_violation": violated,
+            "constraint_values": self._told[N_TOLD:, 0].copy(),
+            "stage_cost": loss,
+            "crashed": crashed,
+            "crash_cause": cause,
+            "clipped_actions": clipped,
         }
+        return reward, crashed, truncated, info

@@ -1,302 +1,480 @@
-"""The compiled step of the tracking task: actions in, observations and rewards out, for any number of rows.
+"""The compiled step of the tracking task: actions in, observations and scores out, four vehicles at a time.
 
-Each vehicle is one row of a float64 array. The single environment is a batch of one row, so that both
-environments are the same computation by construction; blocks of LANES rows only let the integrator's loops
-vectorise.
+A vehicle is a lane of a block (`quad_envs.lanes`), and one vehicle a block of which three lanes are empty:
+single and vector environments are the same computation by construction.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-from ..._numba import inline_kernel, kernel
+from ..._intrinsics import borrowed
+from ..._numba import Int, fused, inline_kernel, inline_lane_kernel, kernel, lane_kernel
 from ...constraints import TOLERANCE, force_from_action
-from ...dynamics import LANES, SCRATCH_ROWS, advance, load_vehicle, store_vehicle
-from ...limits import LIMITS, N_OUTPUT
-from ...observations.tracking import N_OWN, encode_own, encode_preview
-from ...parameters import N_COEFFICIENTS, N_STATE, Array
-from ...reward import stage_cost_kernel
-from ...tasks import CRASH_CAUSES, Task, TeamTask
-from ..shared.vehicle_options import CRASH_TILT
+from ...dynamics import arrive, calm_substep, depart, disturbed_substep, load_air, sincos_in_lanes
+from ...lanes import (
+    ACTION,
+    CAUSE,
+    CHANGE,
+    CLIPPED,
+    COMMAND,
+    COST,
+    CRASHED,
+    EPISODE_COST,
+    FINITE,
+    LANES,
+    N_PLANT,
+    PHI,
+    PLANT,
+    PSI,
+    REWARD,
+    SINES,
+    STAGE_COST,
+    STEP,
+    THETA,
+    TRUNCATED,
+    VALUES,
+    VIOLATED,
+    WANTED,
+    four,
+    move_lane,
+    put_four,
+    put_six,
+    six,
+    twelve,
+)
+from ...observations.tracking import N_OWN, encode_disturbance, encode_own, encode_preview, measured
+from ...plant import N_INPUT, N_STATE, Array
+from ...reward import stage_cost_parts
+from ...table_row import N_TABLE
+from ...tasks import CRASH_CAUSES
+from ..shared.plan import IntArray, floats_1, floats_2, floats_3, floats_4, integers_2
+from ..shared.task_vector import (
+    ACTION_MAX,
+    DT,
+    EPISODE_STEPS,
+    FIRST,
+    HOVER,
+    LOST,
+    LOWER,
+    N_LIMITS,
+    PREVIEW,
+    QUADRATIC,
+    SCALE,
+    SEES_DISTURBANCE,
+    SEES_POSITION,
+    STOP,
+    SUBSTEPS,
+    TILT_OF_CRASH,
+    UPPER,
+    WEIGHT_Q,
+    WEIGHT_R,
+)
 
-# Entries of a vehicle's row.
-PLANT = slice(0, 16)  # [p, V_B, Theta, Omega, F]
-COMMAND = slice(16, 20)  # last rotor commands, N
-COEFFICIENTS = slice(20, 20 + N_COEFFICIENTS)  # of the true vehicle
-FORCE_MAX = slice(36, 40)  # rotor saturation of the true vehicle, N
-REWARD, STAGE_COST, COST, EPISODE_COST, VIOLATED, CRASHED, TRUNCATED, CLIPPED, STEP = range(40, 49)
-VALUES = 49  # constraint values, one per named row
-MOST_VALUES = len(LIMITS) + 1  # a team's last one is the distance between vehicles
-CAUSE = VALUES + MOST_VALUES  # why it crashed, index in `tasks.CRASH_CAUSES`
-ROW_SIZE = CAUSE + 1
-SCORES = slice(REWARD, ROW_SIZE)  # from the reward to the cause
-SCRATCH_SIZE = SCRATCH_ROWS * LANES + 4 * LANES + 16  # integrator, previous commands, one measured plant
+# Rows of what a step tells of n vehicles, (N_TOLD + number of limits, n) float64: the block's rows from
+# REWARD to EPISODE_COST, two rows of int64, one of bytes, and the constraint values, (n, number of limits).
+COUNTS = 4  # clipped actions, cause of the crash
+FLAGS = 6  # crashed, truncated, violated
+N_TOLD = 7
 
-# Entries of the task vector.
-DT, SUBSTEPS, HOVER, EPISODE_STEPS, PREVIEW, QUADRATIC, LOST = range(7)
-SEES_POSITION, SEES_DISTURBANCE, TILT_OF_CRASH, N_LIMITS = range(7, 11)  # the last: how many are set
-ACTION_MAX = slice(11, 15)  # force of action +1, N
-WEIGHT_Q = slice(15, 27)
-WEIGHT_R = slice(27, 31)
-# The limits: the box of every output y = [x, u - u_previous], then of each limit that is set its entries.
-LOWER = 31
-UPPER = LOWER + N_OUTPUT
-FIRST = UPPER + N_OUTPUT  # first output of each
-STOP = FIRST + len(LIMITS)  # behind its last output
-SCALE = STOP + len(LIMITS)  # violation that costs the whole reward of a step
-TASK_SIZE = SCALE + len(LIMITS)
-
-_BY_TILT, _NOT_FINITE, _BY_LOSS = map(CRASH_CAUSES.index, ("tilt", "not finite", "lost"))
-BLOCK_FROM = 8  # rows from which a block of lanes is faster than one row at a time
+_BY_TILT, _NOT_FINITE, _BY_LOSS = map(float, map(CRASH_CAUSES.index, ("tilt", "not finite", "lost")))
+stage_cost_in_lanes = fused(stage_cost_parts)
 
 
-def task_vector(task: Task | TeamTask, substeps: int, lost_distance: float) -> Array:
-    """The task in the form that the kernels read."""
-    limits = task.limits
-    chosen = limits.chosen()
-    vector = np.zeros(TASK_SIZE)
-    vector[:LOWER] = np.array(
-        [
-            task.dt,
-            substeps,
-            task.hover_force,
-            task.episode_steps,
-            task.layout.preview,
-            task.reward == "quadratic",
-            lost_distance,
-            task.layout.position,
-            task.layout.disturbance,
-            CRASH_TILT,
-            len(chosen),
-            *task.force_max,
-            *task.weights.Q,
-            *task.weights.R,
-        ],
-        dtype=np.float64,
+class Flights(NamedTuple):
+    """What n tracking flights consist of, in the order of their plan."""
+
+    blocks: Array  # (n / LANES + 1, N_TRACKING); the last one is for those that begin
+    references: Array  # tables (n_tables, n_steps, N_TABLE)
+    disturbances: Array  # tables (n_tables, n_steps, 2 substeps + 1, 6); no steps for none
+    noises: Array  # tables (n_tables, n_steps, 12); no steps for none
+    which: IntArray  # reference, disturbance and noise table of each vehicle, (3, n)
+    task: Array  # task vector
+
+
+class Told(NamedTuple):
+    """The rows of what a step tells, see N_TOLD."""
+
+    numbers: Array  # (COUNTS, n)
+    counts: IntArray  # (FLAGS - COUNTS, n)
+    flags: NDArray[np.uint8]  # (8 n,), of which 3 n are used
+    values: Array  # (n, number of limits)
+
+
+@inline_kernel
+def _told(block: Array) -> Told:
+    limits, n = block.shape[0] - N_TOLD, block.shape[1]
+    return Told(
+        block[:COUNTS],
+        block[COUNTS:FLAGS].view(np.int64),
+        block[FLAGS].view(np.uint8),
+        block[N_TOLD:].reshape(n, limits),
     )
-    vector[LOWER:UPPER], vector[UPPER:FIRST] = limits.output_box(task.dt)
-    for k, limit in enumerate(chosen):
-        vector[FIRST + k], vector[STOP + k] = limit.outputs.start, limit.outputs.stop
-        vector[SCALE + k] = limits.scale(limit, task.dt)
-    return vector
 
 
 @inline_kernel
-def output(row: Array, previous: Array, i: int) -> float:
-    """Entry i of y = [x, u - u_previous]."""
-    return float(row[i] if i < N_STATE else row[COMMAND][i - N_STATE] - previous[i - N_STATE])
+def _flights(plan: IntArray) -> Flights:
+    return Flights(
+        floats_2(plan, np.int64(0)),
+        floats_3(plan, np.int64(1)),
+        floats_4(plan, np.int64(2)),
+        floats_3(plan, np.int64(3)),
+        integers_2(plan, np.int64(4)),
+        floats_1(plan, np.int64(5)),
+    )
 
 
-@kernel
-def violation_cost(row: Array, previous: Array, task: Array) -> float:
-    """Sum of hinge / scale over the limits, `constraints.constraint_values` compiled; records each."""
-    cost = 0.0
+@inline_lane_kernel
+def _clip(action: float) -> float:
+    return min(max(action, -1.0), 1.0)
+
+
+@inline_lane_kernel
+def _beyond(action: float) -> float:
+    return 1.0 if abs(action) > 1.0 else 0.0
+
+
+@lane_kernel
+def command(w: Array, task: Array) -> None:
+    """Begin the control period of a block: its actions, clipped to [-1, 1] and counted, become commands."""
+    hover, most = task[HOVER], task[ACTION_MAX]
+    most_1, most_2, most_3, most_4 = most[0], most[1], most[2], most[3]
+    for j in range(LANES):
+        a, before = four(w, ACTION + j), four(w, COMMAND + j)
+        u = (
+            force_from_action(_clip(a[0]), hover, most_1),
+            force_from_action(_clip(a[1]), hover, most_2),
+            force_from_action(_clip(a[2]), hover, most_3),
+            force_from_action(_clip(a[3]), hover, most_4),
+        )
+        put_four(w, COMMAND + j, u)
+        put_four(w, CHANGE + j, (u[0] - before[0], u[1] - before[1], u[2] - before[2], u[3] - before[3]))
+        w[CLIPPED + j] += _beyond(a[0]) + _beyond(a[1]) + _beyond(a[2]) + _beyond(a[3])
+        w[STEP + j] += 1.0
+        depart(w, j)
+
+
+@lane_kernel
+def compare(w: Array, task: Array) -> None:
+    """Values of the limits, `constraints.constraint_values` compiled; in COST the sum of hinge / scale."""
+    for j in range(LANES):
+        w[COST + j] = 0.0
     for k in range(int(task[N_LIMITS])):
-        outside = -np.inf
+        value = VALUES + k * LANES
+        for j in range(LANES):
+            w[value + j] = -np.inf
         for i in range(int(task[FIRST + k]), int(task[STOP + k])):
-            y = output(row, previous, i)
-            outside = max(outside, max(task[LOWER + i] - y, y - task[UPPER + i]))
-        row[VALUES + k] = outside
-        cost += outside / task[SCALE + k] if outside > TOLERANCE else 0.0
-    return cost
+            lower, upper = task[LOWER + i], task[UPPER + i]
+            output = (PLANT + i * LANES) if i < N_STATE else (CHANGE + (i - N_STATE) * LANES)
+            for j in range(LANES):
+                y = w[output + j]
+                w[value + j] = max(w[value + j], max(lower - y, y - upper))
+        scale = task[SCALE + k]
+        for j in range(LANES):
+            w[COST + j] += w[value + j] / scale if w[value + j] > TOLERANCE else 0.0
 
 
-@inline_kernel
-def score(row: Array, stage_cost: float, cost: float, crashed: bool, task: Array) -> None:
-    """Reward of a step, see `quad_envs.reward`, and what belongs to it."""
-    v = min(1.0, cost)
-    if task[QUADRATIC] > 0.0:
-        row[REWARD] = -stage_cost - v
-    else:
-        row[REWARD] = 0.0 if crashed else (1.0 - v) / (1.0 + stage_cost)
-    row[STAGE_COST] = stage_cost
-    row[COST] = cost
-    row[VIOLATED] = 1.0 if cost > 0.0 else 0.0
-    row[CRASHED] = 1.0 if crashed else 0.0
-    row[TRUNCATED] = 1.0 if row[STEP] >= task[EPISODE_STEPS] and not crashed else 0.0
-
-
-@kernel
-def _judge(row: Array, reference: Array, previous: Array, finite: bool, task: Array) -> None:
-    """Stage cost, violation, crash and reward of a row after its step; `reference` is of the new time."""
-    off = 0.0
-    for i in range(3):
-        off += (row[i] - reference[i]) ** 2
-    row[CAUSE] = 0.0
-    if not finite:
-        row[CAUSE] = _NOT_FINITE
-    elif max(abs(row[6]), abs(row[7])) >= task[TILT_OF_CRASH]:
-        row[CAUSE] = _BY_TILT
-    elif off > task[LOST] * task[LOST]:
-        row[CAUSE] = _BY_LOSS
-    stage_cost = stage_cost_kernel(row, reference, row[COMMAND], task[HOVER], task[WEIGHT_Q], task[WEIGHT_R])
-    score(row, stage_cost, violation_cost(row, previous, task), row[CAUSE] > 0.0, task)
-
-
-@inline_kernel
-def measure_plant(row: Array, noise: Array, measured: Array) -> None:
-    """The plant of a row as its own sensors see it.
+@inline_lane_kernel
+def score(w: Array, j: Int, loss: float, cause: float, task: tuple[float, float]) -> None:
+    """Reward of the vehicle in lane j, see `quad_envs.reward`, and what belongs to it.
 
     Args:
-        row: The vehicle.
-        noise: Its measurement errors, (n_steps, 12); no steps for none.
-        measured: Result, (16,).
+        w: Block; COST holds the violation cost.
+        j: Lane.
+        loss: Stage cost.
+        cause: Why it crashed, index in `tasks.CRASH_CAUSES`.
+        task: Whether the reward is quadratic; control steps of an episode.
     """
-    for i in range(16):
-        measured[i] = row[i]
-    if noise.shape[0] > 0:
-        k = min(int(row[STEP]), noise.shape[0] - 1)
-        for i in range(12):
-            measured[i] += noise[k, i]
+    quadratic, steps = task
+    cost = w[COST + j]
+    v = min(1.0, cost)
+    bounded = 0.0 if cause > 0.0 else (1.0 - v) / (1.0 + loss)
+    w[REWARD + j] = -loss - v if quadratic > 0.0 else bounded
+    w[STAGE_COST + j] = loss
+    w[EPISODE_COST + j] += cost
+    w[VIOLATED + j] = 1.0 if cost > 0.0 else 0.0
+    w[CAUSE + j] = cause
+    w[CRASHED + j] = 1.0 if cause > 0.0 else 0.0
+    w[TRUNCATED + j] = 1.0 if (w[STEP + j] >= steps) & (cause == 0.0) else 0.0
+
+
+@inline_kernel
+def weights(task: Array) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """The diagonals Q and R."""
+    q, r = task[WEIGHT_Q], task[WEIGHT_R]
+    Q = q[0], q[1], q[2], q[3], q[4], q[5], q[6], q[7], q[8], q[9], q[10], q[11]
+    return Q, (r[0], r[1], r[2], r[3])
+
+
+@lane_kernel
+def judge(w: Array, task: Array) -> None:
+    """Stage cost, crash and reward of a block after its step; WANTED is of the new time."""
+    compare(w, task)
+    hover, lost, steep = task[HOVER], task[LOST], task[TILT_OF_CRASH]
+    kind = task[QUADRATIC], task[EPISODE_STEPS]
+    Q, R = weights(task)
+    for j in range(LANES):
+        sines = sincos_in_lanes(w[PHI + j]) + sincos_in_lanes(w[THETA + j]) + sincos_in_lanes(w[PSI + j])
+        put_six(w, SINES + j, sines)
+        x, u = twelve(w, PLANT + j), four(w, COMMAND + j)
+        wanted = six(w, WANTED + j) + four(w, WANTED + 6 * LANES + j)
+        parts = stage_cost_in_lanes(x, sines, wanted, u, hover, Q, R)
+        off = (x[0] - wanted[0]) ** 2 + (x[1] - wanted[1]) ** 2 + (x[2] - wanted[2]) ** 2
+        cause = _BY_LOSS if off > lost * lost else 0.0
+        cause = _BY_TILT if max(abs(x[6]), abs(x[7])) >= steep else cause
+        cause = _NOT_FINITE if w[FINITE + j] == 0.0 else cause
+        score(w, j, parts[0] + parts[1] + parts[2] + parts[3] + parts[4], cause, kind)
 
 
 @inline_kernel
 def encode_vehicle(
-    row: Array, measured: Array, disturbance: Array, task: Array, out: NDArray[np.float32]
+    w: Array,
+    j: Int,
+    x: tuple[float, ...],
+    yaw: tuple[float, float],
+    disturbance: Array,
+    task: Array,
+    out: NDArray[np.float32],
 ) -> int:
-    """Write own, position and disturbance of an observation; returns where they end."""
-    encode_own(out, measured, row[COMMAND])
+    """Write own, position and disturbance of an observation; returns where they end.
+
+    Args:
+        w: Block.
+        j: Lane.
+        x: State as it is measured.
+        yaw: Sine and cosine of the measured yaw.
+        disturbance: Table, (n_steps, n_nodes, 6).
+        task: Task vector.
+        out: (>= 27,) float32.
+    """
+    encode_own(out, w, j, x, yaw)
     start = N_OWN
     if task[SEES_POSITION] > 0.0:
-        for i in range(3):
-            out[start + i] = measured[i]
+        out[start], out[start + 1], out[start + 2] = x[0], x[1], x[2]
         start += 3
     if task[SEES_DISTURBANCE] > 0.0:
-        k = int(row[STEP])
-        for i in range(6):
-            out[start + i] = 0.0
-        if 0 < disturbance.shape[0] and k < disturbance.shape[0]:
-            for i in range(6):
-                out[start + i] = disturbance[k, disturbance.shape[1] // 2, i]
+        encode_disturbance(out, start, int(w[STEP + j]), disturbance)
         start += 6
     return start
 
 
-@kernel
+@inline_kernel
 def observe(
-    row: Array,
+    w: Array,
+    j: Int,
     reference: Array,
     disturbance: Array,
     noise: Array,
     task: Array,
-    measured: Array,
     out: NDArray[np.float32],
 ) -> None:
-    """Write the observation of a row.
+    """Write the observation of the vehicle in lane j.
 
     Args:
-        row: The vehicle.
-        reference: Its reference table, (n_steps, 9).
+        w: Block.
+        j: Lane.
+        reference: Its reference table, (n_steps, N_TABLE).
         disturbance: Its disturbance table, (n_steps, n_nodes, 6).
         noise: Its measurement errors, (n_steps, 12); no steps for none.
         task: Task vector.
-        measured: Scratch, (16,).
         out: (layout.size,) float32.
     """
-    measure_plant(row, noise, measured)
-    start = encode_vehicle(row, measured, disturbance, task, out)
+    x, yaw = measured(w, j, noise)
+    start, step = encode_vehicle(w, j, x, yaw, disturbance, task, out), int(w[STEP + j])
     stages = int(task[PREVIEW]) + 1
-    encode_preview(out, start, reference, min(int(row[STEP]), reference.shape[0] - stages), stages, measured)
+    encode_preview(out, start, reference, min(step, reference.shape[0] - stages), stages, x)
 
 
 @inline_kernel
-def apply_action(row: Array, actions: NDArray[np.floating], task: Array) -> None:
-    """Take an action over into the row; entries outside [-1, 1] are clipped and counted."""
-    for i in range(4):
-        action = float(actions[i])
-        if action < -1.0 or action > 1.0:
-            row[CLIPPED] += 1.0
-            action = min(max(action, -1.0), 1.0)
-        row[COMMAND][i] = force_from_action(action, task[HOVER], task[ACTION_MAX][i])
+def tell(w: Array, j: Int, i: int, flights: Flights, out: NDArray[np.float32], told: Told) -> None:
+    """Write observation and scores of vehicle i, which is in lane j."""
+    which, n = flights.which, told.numbers.shape[1]
+    for k in range(COUNTS):
+        told.numbers[k, i] = w[REWARD + k * LANES + j]
+    told.counts[0, i], told.counts[1, i] = int(w[CLIPPED + j]), int(w[CAUSE + j])
+    told.flags[i] = w[CRASHED + j] > 0.0
+    told.flags[n + i] = w[TRUNCATED + j] > 0.0
+    told.flags[2 * n + i] = w[VIOLATED + j] > 0.0
+    for k in range(told.values.shape[1]):
+        told.values[i, k] = w[VALUES + k * LANES + j]
+    observe(
+        w,
+        j,
+        flights.references[which[0, i]],
+        flights.disturbances[which[1, i]],
+        flights.noises[which[2, i]],
+        flights.task,
+        out[i],
+    )
+
+
+@inline_kernel
+def want(w: Array, j: Int, reference: Array) -> None:
+    """Take over the row of the reference at the present step."""
+    row = reference[min(int(w[STEP + j]), reference.shape[0] - 1)]
+    for k in range(N_TABLE):
+        w[WANTED + k * LANES + j] = row[k]
+
+
+@inline_kernel
+def substep(
+    w: Array, s: int, lanes: int, first: int, disturbances: Array, which: IntArray, task: Array
+) -> None:
+    """Integrate a block over substep s; arguments as in `fly`."""
+    h = task[DT] / task[SUBSTEPS]
+    if disturbances.shape[1] == 0:
+        calm_substep(w, h)
+    else:
+        for j in range(lanes):
+            k = min(int(w[STEP + j]) - 1, disturbances.shape[1] - 1)
+            load_air(w, j, disturbances[which[first + j], k], s)
+        disturbed_substep(w, h)
+
+
+@inline_kernel
+def fly(w: Array, lanes: int, first: int, disturbances: Array, which: IntArray, task: Array) -> None:
+    """Integrate a block over its control period.
+
+    Args:
+        w: Block.
+        lanes: Vehicles in it.
+        first: The first of them.
+        disturbances: Tables (n_tables, n_steps, 2 substeps + 1, 6), of which the last row holds on.
+        which: Table of each vehicle, (n,).
+        task: Task vector.
+    """
+    for s in range(int(task[SUBSTEPS])):
+        substep(w, s, lanes, first, disturbances, which, task)
+    arrive(w)
 
 
 @kernel
-def step_rows(
-    rows: Array,
-    references: Array,
-    disturbances: Array,
-    noises: Array,
-    which: NDArray[np.int64],
-    flat_actions: NDArray[np.floating],
-    task: Array,
-    scratch: Array,
-    steps: NDArray[np.int64],
+def first_unsound(actions: NDArray[np.float32]) -> int:
+    """Index of the first action that is not a finite number; -1 if all are."""
+    sound = True
+    for a in range(actions.size):
+        sound &= abs(actions[a]) < np.inf
+    if not sound:
+        for a in range(actions.size):
+            if not np.isfinite(actions[a]):
+                return a
+    return -1
+
+
+@lane_kernel
+def step_flights(
+    plan: IntArray,
+    flat_actions: NDArray[np.float32],
     flat_out: NDArray[np.float32],
+    told_block: Array,
+    begin: int,
+    end: int,
 ) -> int:
-    """One control period of every row.
+    """One control period of the vehicles in blocks begin..end-1.
 
     Args:
-        rows: (n, ROW_SIZE), modified in place.
-        references: Tables (n_tables, n_steps, 9).
-        disturbances: Tables (n_tables, n_steps, 2 substeps + 1, 6); no steps for none.
-        noises: Tables (n_tables, n_steps, 12); no steps for none.
-        which: Reference, disturbance and noise table of each row, (3, n) int64.
-        flat_actions: (4 n,).
-        task: Task vector.
-        scratch: (SCRATCH_SIZE,).
-        steps: Scratch, (n,) int64.
-        flat_out: Observations, (n layout.size,) float32.
+        plan: Of the `Flights`.
+        flat_actions: Of all vehicles, (4 n,).
+        flat_out: Observations of all, (n layout.size,).
+        told_block: Scores of all, see N_TOLD.
+        begin: First block.
+        end: Block before which to stop.
 
     Returns:
-        -1, or the flat index of the first non-finite action; then nothing was changed.
+        Number of episodes that ended; or -1 - a, if action a is not finite: then nothing was changed.
     """
-    n = rows.shape[0]
-    actions = flat_actions.reshape(n, 4)
-    out = flat_out.reshape(n, flat_out.size // n)
-    for i in range(n):
-        for a in range(4):
-            if not np.isfinite(actions[i, a]):
-                return 4 * i + a
-    substeps = int(task[SUBSTEPS])
-    h = task[DT] / substeps
-    stride = np.int64(LANES) if n >= BLOCK_FROM else np.int64(1)
-    measured = scratch[scratch.size - 16 :]
-    previous = scratch[scratch.size - 16 - 4 * LANES : scratch.size - 16].reshape(LANES, 4)
-    for first in range(0, n, stride):
-        lanes = min(stride, n - first)
+    bad = first_unsound(flat_actions)
+    if bad >= 0:
+        return -1 - bad
+    flights, told, n = _flights(plan), _told(borrowed(told_block)), told_block.shape[1]
+    actions, out = (
+        borrowed(flat_actions).reshape(n, N_INPUT),
+        borrowed(flat_out).reshape(n, flat_out.size // n),
+    )
+    task = flights.task
+    ended = 0
+    for b in range(begin, end):
+        w, first = flights.blocks[b], b * LANES
+        lanes = min(LANES, n - first)
         for j in range(lanes):
-            row = rows[first + j]
-            for a in range(4):
-                previous[j, a] = row[COMMAND][a]
-            apply_action(row, actions[first + j], task)
-            steps[first + j] = int(row[STEP])
-            load_vehicle(scratch, j, stride, row, row[COMMAND], row[FORCE_MAX], row[COEFFICIENTS], h)
-        advance(scratch, stride, lanes, 0, substeps, h, disturbances, which[1, first:], steps[first:])
+            for a in range(N_INPUT):
+                w[ACTION + a * LANES + j] = actions[first + j, a]
+        command(w, task)
+        fly(w, lanes, first, flights.disturbances, flights.which[1], task)
         for j in range(lanes):
-            i = first + j
-            row = rows[i]
-            finite = store_vehicle(scratch, j, stride, row)
-            row[STEP] += 1.0
-            reference = references[which[0, i]]
-            k = min(int(row[STEP]), reference.shape[0] - 1)
-            _judge(row, reference[k], previous[j], finite, task)
-            row[EPISODE_COST] += row[COST]
-            observe(row, reference, disturbances[which[1, i]], noises[which[2, i]], task, measured, out[i])
+            want(w, j, flights.references[flights.which[0, first + j]])
+        judge(w, task)
+        for j in range(lanes):
+            ended += int(w[CRASHED + j] + w[TRUNCATED + j])
+            tell(w, j, first + j, flights, out, told)
+    return ended
+
+
+@inline_kernel
+def begin_lane(w: Array, j: Int, plant: Array, hover: float) -> None:
+    """A vehicle at the start of an episode, in hover; which vehicle it is stays."""
+    for i in range(N_PLANT):
+        w[PLANT + i * LANES + j] = plant[i]
+    for i in range(N_INPUT):
+        w[COMMAND + i * LANES + j], w[CHANGE + i * LANES + j] = hover, 0.0
+    w[STEP + j], w[CLIPPED + j], w[FINITE + j] = 0.0, 0.0, 1.0
+
+
+@inline_kernel
+def _is_lost(plant: Array, reference: Array, task: Array) -> bool:
+    """Whether a plant is too far from the beginning of its reference."""
+    off = 0.0
+    for i in range(3):
+        off += (plant[i] - reference[0, i]) ** 2
+    return bool(off > task[LOST] * task[LOST])
+
+
+@kernel
+def begin_flights(
+    plan: IntArray, index: IntArray, plants: Array, flat_out: NDArray[np.float32], told_block: Array
+) -> int:
+    """Begin episodes, and tell what their vehicles see.
+
+    Args:
+        plan: Of the `Flights`.
+        index: Vehicles, (m,).
+        plants: Where they start, (m, 16).
+        flat_out: As in `step_flights`.
+        told_block: As in `step_flights`.
+
+    Returns:
+        -1, or the place in `index` of the first vehicle that starts lost: then nothing was changed.
+    """
+    flights, told, n = _flights(plan), _told(borrowed(told_block)), told_block.shape[1]
+    out, task = borrowed(flat_out).reshape(n, flat_out.size // n), flights.task
+    blocks, w = flights.blocks, flights.blocks[flights.blocks.shape[0] - 1]
+    for m in range(index.size):
+        if _is_lost(plants[m], flights.references[flights.which[0, index[m]]], task):
+            return m
+    for first in range(0, index.size, LANES):
+        lanes = min(LANES, index.size - first)
+        for j in range(lanes):
+            i = index[first + j]
+            move_lane(blocks[i // LANES], i % LANES, w, j)
+            begin_lane(w, j, plants[first + j], task[HOVER])
+            want(w, j, flights.references[flights.which[0, i]])
+        judge(w, task)
+        for j in range(lanes):
+            i = index[first + j]
+            w[REWARD + j], w[EPISODE_COST + j] = 0.0, 0.0
+            tell(w, j, i, flights, out, told)
+            move_lane(w, j, blocks[i // LANES], i % LANES)
     return -1
 
 
 @kernel
-def begin_row(rows: Array, i: int, reference: Array, task: Array) -> None:
-    """Stage cost and constraint values of row i after a reset, with no command change yet."""
-    row = rows[i]
-    _judge(row, reference[0], row[COMMAND], True, task)
-
-
-@kernel
-def observe_row(
-    rows: Array,
-    i: int,
-    references: Array,
-    disturbances: Array,
-    noises: Array,
-    which: NDArray[np.int64],
-    task: Array,
-    scratch: Array,
-    out: NDArray[np.float32],
-) -> None:
-    """Observation of row i as it stands."""
-    measured = scratch[scratch.size - 16 :]
-    observe(
-        rows[i], references[which[0, i]], disturbances[which[1, i]], noises[which[2, i]], task, measured, out
-    )
+def tell_flights(plan: IntArray, index: IntArray, flat_out: NDArray[np.float32], told_block: Array) -> None:
+    """Tell of the vehicles `index` as they are; arguments as in `step_flights`."""
+    flights, told, n = _flights(plan), _told(borrowed(told_block)), told_block.shape[1]
+    out = borrowed(flat_out).reshape(n, flat_out.size // n)
+    for m in range(index.size):
+        i = index[m]
+        tell(flights.blocks[i // LANES], i % LANES, i, flights, out, told)

@@ -16,8 +16,8 @@ from ...observations.tracking import N_REFERENCE, TrackingLayout
 from ...parameters import N_STATE, POSITION, Array
 from ...references import ReferenceLike
 from ...registration import TIME_LIMIT, TRACKING
+from ...table_row import N_TABLE
 from ...tasks import Task
-from ...turning import N_TABLE
 from ..shared.given import MOST_STATE
 from ..shared.vehicle_options import CRASH_TILT, MOST_PREVIEW, MOST_STEPS, VehicleOptions
 

@@ -13,16 +13,17 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from ...checks import require_whole
-from ...observations.tracking import N_REFERENCE
-from ...parameters import Array
+from ...lanes import N_PLANT, PLANT
+from ...plant import Array
+from ...table_row import N_REFERENCE
 from ...tasks import Task
-from ..shared.given import as_numbers
+from ..shared.given import as_numbers, given_plants
 from ..shared.render_modes import NO_RENDERING, checked_rendering
 from ..shared.specified import Specified
-from ..shared.vector_parts import Generators, score_infos, seeded, with_presence
+from ..shared.vector_parts import Generators, presence, seeded
 from .batch import TrackingBatch
-from .kernel import CRASHED, PLANT, REWARD, TRUNCATED
 from .options import TrackingOptions
+from .scores import Scores, info_of, scores_of
 
 if TYPE_CHECKING:
     from ..pictures import TrackingPictures
@@ -40,6 +41,8 @@ class TrackingVectorEnv(
     Args:
         num_envs: Number of flights.
         autoreset_mode: Gymnasium's NEXT_STEP (default), SAME_STEP or DISABLED.
+        threads: Threads that share the flights of a step, at most one for four flights. Results do not depend
+            on it; below a thousand flights one thread is the fastest, and more than there are cores are slow.
         render_mode: None or "rgb_array".
         render_size: Width and height of each picture, pixels.
         kwargs: As for `TrackingEnv`.
@@ -53,11 +56,13 @@ class TrackingVectorEnv(
         num_envs: int = 1,
         *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        threads: int = 1,
         render_mode: str | None = None,
         render_size: tuple[int, int] = (640, 480),
         **kwargs: Any,
     ) -> None:
         require_whole("num_envs", num_envs, 1)
+        require_whole("threads", threads, 1)
         size = checked_rendering(render_mode, ("rgb_array",), render_size)
         options = TrackingOptions.from_kwargs(kwargs)
         self.num_envs, self.render_mode = num_envs, render_mode
@@ -67,19 +72,21 @@ class TrackingVectorEnv(
             "render_fps": 20,
             "autoreset_mode": self.autoreset_mode,
         }
-        self._batch = TrackingBatch(options, num_envs)
+        self._batch = TrackingBatch(options, num_envs, threads)
         self._pictures: list[TrackingPictures] = []
         if render_mode:
             from ..pictures import TrackingPictures  # not needed by who trains and measures
 
             self._pictures = [TrackingPictures(self._batch, i, size) for i in range(num_envs)]
-        self._n_values = len(self.task.constraint_names)
+        self._masks = presence(num_envs, info_of(scores_of(self._batch.fresh_scores())))
         self.single_action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (self.task.layout.size,), np.float32)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._shape = (num_envs, self.task.layout.size)
         self._generators: Generators = []
         self._done = np.zeros(num_envs, dtype=np.bool_)
+        self._any_done = False
 
     @property
     def task(self) -> Task:
@@ -89,7 +96,7 @@ class TrackingVectorEnv(
     @property
     def state(self) -> Array:
         """Copy of the plant states [p, V_B, Theta, Omega, F], (n, 16). For study and tests."""
-        return self._batch.rows[:, PLANT].copy()
+        return self._batch.vehicles.read(PLANT, N_PLANT)
 
     @property
     def reference(self) -> Array:
@@ -112,20 +119,22 @@ class TrackingVectorEnv(
             raise ValueError(f"reset_mask must have shape ({self.num_envs},), got {mask.shape}")
         if not (mask.all() or self._generators):
             raise ValueError("the first reset must begin all rows; reset_mask is for later ones")
-        states = self._given_states(given.pop("state", None))
+        state = given.pop("state", None)
+        states = None if state is None else self._given_states(state, mask)
+        if given:
+            self._batch.given_states(given)
         self._generators = seeded(self._generators, seed, mask)
-        observations = self._fresh_observations()
-        for i in range(self.num_envs):
-            if mask[i]:
-                one = given if states is None else {**given, "state": states[i]}
-                self._batch.reset_row(i, self._generators[i], observations[i], one)
-            else:
-                self._batch.observe(i, observations[i])
+        observations, told = self._fresh_observations(), self._batch.fresh_scores()
+        index, rest = np.flatnonzero(mask), np.flatnonzero(~mask)
+        self._begin(index, observations, told, states)
+        if rest.size:
+            self._batch.tell(rest, observations.reshape(-1), told)
         self._done[mask] = False
+        self._any_done = bool(self._done.any())
         for i, pictures in enumerate(self._pictures):
             if mask[i]:
                 pictures.record()
-        return observations, self._info()
+        return observations, self._info(scores_of(told))
 
     def step(self, actions: NDArray[np.float32]) -> _Step:
         """Hold the rotor commands of all flights over one control period."""
@@ -134,25 +143,23 @@ class TrackingVectorEnv(
             raise ValueError(f"actions must have shape ({self.num_envs}, 4), got {actions.shape}")
         if not self._generators:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        finished = self._done
-        if self.autoreset_mode is AutoresetMode.NEXT_STEP and finished.any():
-            actions = np.where(finished[:, None], np.float32(0.0), actions)
-        observations = self._fresh_observations()
-        self._batch.step(actions, observations)
-        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
-            self._reset_rows(finished, observations)
-        rows = self._batch.rows
-        rewards = rows[:, REWARD].copy()
-        terminated, truncated = rows[:, CRASHED] > 0.0, rows[:, TRUNCATED] > 0.0
-        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
-            rewards[finished] = 0.0
-        self._done = terminated | truncated
-        info = self._info()
-        if self.autoreset_mode is AutoresetMode.SAME_STEP and self._done.any():
-            info = self._reset_in_same_step(observations, info)
+        again = self._any_done and self.autoreset_mode is AutoresetMode.NEXT_STEP
+        if again:
+            actions = np.where(self._done[:, None], np.float32(0.0), actions)
+        observations, told = self._fresh_observations(), self._batch.fresh_scores()
+        ended = self._batch.step(actions.reshape(-1), observations.reshape(-1), told)
+        if again:
+            self._begin(np.flatnonzero(self._done), observations, told)
+        scores = scores_of(told)
+        if ended or self._any_done:
+            self._done = scores.crashed | scores.truncated
+            self._any_done = bool(self._done.any())
+        info = self._info(scores)
+        if self._any_done and self.autoreset_mode is AutoresetMode.SAME_STEP:
+            info = self._begin_in_same_step(observations, info)
         for pictures in self._pictures:
             pictures.record()
-        return observations, rewards, terminated, truncated, info
+        return observations, scores.reward, scores.crashed, scores.truncated, info
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """One picture of each flight, (height, width, 3), with `render_mode="rgb_array"`."""
@@ -161,10 +168,8 @@ class TrackingVectorEnv(
             return None
         return tuple(pictures.frame() for pictures in self._pictures)
 
-    def _given_states(self, state: Any) -> Array | None:
-        """Start states from the reset options, one row per flight."""
-        if state is None:
-            return None
+    def _given_states(self, state: Any, mask: Bools) -> Array:
+        """Plants from the reset options of the flights that begin, (m, 16)."""
         states = as_numbers(state)
         if states.ndim == 1:
             states = np.tile(states, (self.num_envs, 1))
@@ -173,20 +178,24 @@ class TrackingVectorEnv(
                 f"reset option 'state' must be one state for all or {self.num_envs} rows, "
                 f"got shape {states.shape}"
             )
-        return states
+        return given_plants(states[mask], (int(mask.sum()),), self.task.hover_force)
 
-    def _reset_rows(self, which: Bools, observations: Observations) -> None:
-        for i in np.flatnonzero(which).tolist():
-            self._batch.reset_row(i, self._generators[i], observations[i])
+    def _begin(
+        self, index: NDArray[np.int64], observations: Observations, told: Array, states: Array | None = None
+    ) -> None:
+        generators = [self._generators[i] for i in index.tolist()]
+        self._batch.begin(index, generators, observations.reshape(-1), told, states)
 
-    def _reset_in_same_step(self, observations: Observations, info: dict[str, Any]) -> dict[str, Any]:
+    def _begin_in_same_step(self, observations: Observations, info: dict[str, Any]) -> dict[str, Any]:
         """Begin anew where an episode ended; what was before travels in `final_obs` and `final_info`."""
         done = self._done
         final = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(done).tolist():
             final[i] = observations[i].copy()
-        self._reset_rows(done, observations)
-        fresh = self._info()
+        told = self._batch.fresh_scores()
+        self._begin(np.flatnonzero(done), observations, told)
+        self._batch.tell(np.flatnonzero(~done), observations.reshape(-1), told)
+        fresh = self._info(scores_of(told))
         fresh["final_obs"], fresh["_final_obs"] = final, done.copy()
         last = {key: value.copy() for key, value in info.items() if not key.startswith("_")}
         fresh["final_info"] = last | {f"_{key}": done.copy() for key in last}
@@ -194,7 +203,7 @@ class TrackingVectorEnv(
         return fresh
 
     def _fresh_observations(self) -> Observations:
-        return np.empty((self.num_envs, self.task.layout.size), dtype=np.float32)
+        return np.empty(self._shape, np.float32)
 
-    def _info(self) -> dict[str, Any]:
-        return with_presence(score_infos(self._batch.rows, self._n_values), self.num_envs)
+    def _info(self, scores: Scores) -> dict[str, Any]:
+        return info_of(scores) | self._masks

@@ -1,0 +1,144 @@
+"""What numba does not offer: vector registers where loops are too short, and arrays at an address.
+
+Numba runs LLVM without the pass that puts neighbouring assignments together. Each function has a twin for
+kernels that run as plain Python (NUMBA_DISABLE_JIT).
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils, config
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from .parameters import Array
+
+
+def _write_stage(
+    out: NDArray[np.float32], start: int, table: Array, row: int, p: tuple[float, float, float]
+) -> None:
+    """Eight numbers out[start:] = table[row, :8] - [p, 0, 0, 0, 0, 0], as float32; both are C-contiguous."""
+    out[start : start + 3] = table[row, :3] - np.array(p)
+    out[start + 3 : start + 8] = table[row, 3:8]
+
+
+def _take_nearer(places: Array, at: int, x: float, y: float, z: float) -> None:
+    """Take the squared distances of four places to (x, y, z) into the smallest ones so far.
+
+    From places[at] on stand four x, four y, four z and the four squared distances.
+    """
+    four = places[at : at + 16].reshape(4, 4)
+    square = (four[0] - x) ** 2 + (four[1] - y) ** 2 + (four[2] - z) ** 2
+    four[3] = np.minimum(square, four[3])
+
+
+def _borrowed(array: Any) -> Any:
+    """The same array, of which references are not counted: whoever called the kernel keeps it."""
+    return array
+
+
+def _floats_at(address: int) -> Any:
+    """Pointer to float64 numbers, for `numba.carray`."""
+    return ctypes.cast(int(address), ctypes.POINTER(ctypes.c_double))
+
+
+def _integers_at(address: int) -> Any:
+    """Pointer to int64 numbers, for `numba.carray`."""
+    return ctypes.cast(int(address), ctypes.POINTER(ctypes.c_int64))
+
+
+def _pointer(element: Any) -> Any:
+    """The intrinsic that takes an address as a pointer to such elements."""
+
+    def at(typing: Any, address: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            return builder.inttoptr(arguments[0], context.get_value_type(element).as_pointer())
+
+        return types.CPointer(element)(types.intp), generate
+
+    return intrinsic(at)
+
+
+def _without_count(typing: Any, array: Any) -> Any:
+    """`_borrowed` as an array that nobody owns."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        found = context.make_array(array)(context, builder, arguments[0])
+        found.meminfo = cgutils.get_null_value(found.meminfo.type)
+        found.parent = cgutils.get_null_value(found.parent.type)
+        return found._getvalue()
+
+    return array(array), generate
+
+
+def _in_registers(typing: Any, out: Any, start: Any, table: Any, row: Any, p: Any) -> Any:
+    """`_write_stage` as four and four doubles that become eight floats."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        out_array = context.make_array(out)(context, builder, arguments[0])
+        table_array = context.make_array(table)(context, builder, arguments[2])
+        width = cgutils.unpack_tuple(builder, table_array.shape)[1]
+        target = builder.gep(out_array.data, [arguments[1]])
+        source = builder.gep(table_array.data, [builder.mul(arguments[3], width)])
+        doubles, floats = ir.VectorType(ir.DoubleType(), 4), ir.VectorType(ir.FloatType(), 4)
+        halves = [
+            builder.load(
+                builder.bitcast(builder.gep(source, [ir.Constant(ir.IntType(64), at)]), doubles.as_pointer()),
+                align=8,
+            )
+            for at in (0, 4)
+        ]
+        shift = ir.Constant(doubles, [0.0] * 4)
+        for i, value in enumerate(cgutils.unpack_tuple(builder, arguments[4])):
+            shift = builder.insert_element(shift, value, ir.Constant(ir.IntType(32), i))
+        near = builder.fptrunc(builder.fsub(halves[0], shift), floats)
+        far = builder.fptrunc(halves[1], floats)
+        places = ir.Constant(ir.VectorType(ir.IntType(32), 8), list(range(8)))
+        whole = ir.VectorType(ir.FloatType(), 8).as_pointer()
+        builder.store(builder.shuffle_vector(near, far, places), builder.bitcast(target, whole), align=4)
+        return context.get_dummy_value()
+
+    return types.void(out, types.intp, table, types.intp, p), generate
+
+
+def _nearer_in_registers(typing: Any, places: Any, at: Any, x: Any, y: Any, z: Any) -> Any:
+    """`_take_nearer` on four doubles at once."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(places)(context, builder, arguments[0]).data
+        doubles, lane = ir.VectorType(ir.DoubleType(), 4), ir.IntType(32)
+
+        def row(k: int) -> Any:
+            start = builder.add(arguments[1], ir.Constant(ir.IntType(64), 4 * k))
+            return builder.bitcast(builder.gep(data, [start]), doubles.as_pointer())
+
+        square = None
+        for k, place in enumerate(arguments[2:]):
+            first = builder.insert_element(ir.Constant(doubles, ir.Undefined), place, ir.Constant(lane, 0))
+            broadcast = builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(lane, 4), [0] * 4))
+            apart = builder.fsub(builder.load(row(k), align=8), broadcast)
+            part = builder.fmul(apart, apart)
+            square = part if square is None else builder.fadd(square, part)
+        nearest = builder.load(row(3), align=8)
+        nearer = builder.fcmp_ordered("<", square, nearest)
+        builder.store(builder.select(nearer, square, nearest), row(3), align=8)
+        return context.get_dummy_value()
+
+    return types.void(places, types.intp, types.float64, types.float64, types.float64), generate
+
+
+write_stage: Any
+take_nearer: Any
+borrowed: Any
+if getattr(config, "DISABLE_JIT", False):
+    take_nearer = _take_nearer
+    write_stage, borrowed, floats_at, integers_at = _write_stage, _borrowed, _floats_at, _integers_at
+else:
+    write_stage, borrowed = intrinsic(_in_registers), intrinsic(_without_count)
+    take_nearer = intrinsic(_nearer_in_registers)
+    floats_at, integers_at = _pointer(types.float64), _pointer(types.int64)

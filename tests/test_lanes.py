@@ -1,0 +1,200 @@
+"""Four vehicles side by side: lanes against readable equations, in vector instructions, on threads."""
+
+import copy
+import re
+
+import gymnasium as gym
+import llvmlite.binding as llvm
+import numba
+import numpy as np
+import pytest
+
+from quad_envs import Steady
+from quad_envs.constraints import (
+    TOLERANCE,
+    constraint_scales,
+    constraint_values,
+    forces_from_actions,
+)
+from quad_envs.dynamics import (
+    LARGEST,
+    arrive,
+    calm_substep,
+    derivative_reference,
+    disturbed_substep,
+    rotor_limits,
+)
+from quad_envs.envs.shared.task_vector import task_vector
+from quad_envs.envs.shared.vehicle_options import CRASH_TILT
+from quad_envs.envs.tracking.kernel import command, judge
+from quad_envs.lanes import LANES, N_FLIGHT, N_TRACKING, Blocks
+from quad_envs.reward import stage_cost
+from quad_envs.turning import with_turn_rates
+
+HELIX = "quad/HelixTracking-v0"
+LIMITS = {
+    "kappa": (0.5, 0.6, 0.7, 0.8),
+    "frame": "x",
+    "rate_limit": 20.0,
+    "tilt_limit": 0.4,
+    "velocity_limit": 2.0,
+    "position_limit": ((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0)),
+}
+AVX = llvm.get_host_cpu_features().get("avx2", False)
+FORCE, TORQUE = (0.4, -0.3, 0.2), (0.002, -0.001, 0.001)
+
+
+class Twin:
+    """n flights of a task in readable equations: RK4 with exact sines, rotors that lag in closed form."""
+
+    def __init__(self, task, substeps, plants, force=(0.0, 0.0, 0.0), torque=(0.0, 0.0, 0.0)):
+        self.task, self.substeps, self.air = task, substeps, {"force": force, "torque": torque}
+        self.plants, self.command = plants.copy(), np.full((len(plants), 4), task.hover_force)
+
+    def fly(self, commands):
+        """Plants after a control period."""
+        task, h = self.task, self.task.dt / self.substeps
+        x, F = self.plants[:, :12], self.plants[:, 12:]
+        target = np.clip(commands, 0.0, rotor_limits(task.force_max, task.params))
+
+        def slope(state, forces):
+            return derivative_reference(state, forces, task.params, **self.air)
+
+        def lagged(time):
+            return target + (F - target) * np.exp(-task.params.rotor_rate * time)
+
+        for _ in range(self.substeps):
+            half, whole = lagged(0.5 * h), lagged(h)
+            k_1 = slope(x, F)
+            k_2 = slope(x + 0.5 * h * k_1, half)
+            k_3 = slope(x + 0.5 * h * k_2, half)
+            k_4 = slope(x + h * k_3, whole)
+            x, F = x + h / 6.0 * (k_1 + 2.0 * k_2 + 2.0 * k_3 + k_4), whole
+        return np.concatenate([x, F], axis=1)
+
+    def step(self, actions, row, lost):
+        """Move, and judge against a row of the reference: reward, stage cost, cost, crashed."""
+        task, previous = self.task, self.command
+        self.command = forces_from_actions(actions, task.hover_force, task.force_max)
+        with np.errstate(all="ignore"):
+            moved = self.fly(self.command)
+        finite = np.abs(moved).sum(axis=1) < LARGEST
+        self.plants = np.where(finite[:, None], moved, self.plants)
+        loss = stage_cost(self.plants, row, self.command, task.hover_force, task.weights)
+        values = constraint_values(self.plants, self.command, previous, task.limits, task.dt)
+        scales = constraint_scales(task.limits, task.dt)
+        cost = np.where(values > TOLERANCE, values / scales, 0.0).sum(axis=1)
+        off = np.linalg.norm(self.plants[:, :3] - row[:3], axis=1)
+        crashed = ~finite | (np.abs(self.plants[:, 6:8]).max(axis=1) >= CRASH_TILT) | (off > lost)
+        reward = np.where(crashed, 0.0, (1.0 - np.minimum(cost, 1.0)) / (1.0 + loss))
+        return reward, loss, cost, crashed
+
+
+@pytest.mark.parametrize("substeps", [1, 5])
+@pytest.mark.parametrize("air", [None, Steady(force=FORCE, torque=TORQUE)], ids=["calm", "disturbed"])
+def test_lanes_fly_as_the_readable_equations_over_random_episodes_with_crashes(air, substeps):
+    n, lost = 4 * LANES + 3, 6.0
+    env = gym.make_vec(
+        HELIX,
+        num_envs=n,
+        autoreset_mode="Disabled",
+        disturbance=air,
+        substeps=substeps,
+        lost_distance=lost,
+        **LIMITS,
+    )
+    env.reset(seed=1)
+    rng, crashes = np.random.default_rng(0), 0
+    table = with_turn_rates(env.unwrapped.reference[0], env.unwrapped.task.dt)
+    known = {} if air is None else {"force": FORCE, "torque": TORQUE}
+    twin = Twin(env.unwrapped.task, substeps, env.unwrapped.state, **known)
+    flying = np.ones(n, dtype=bool)
+    for k in range(1, 120):
+        actions = (rng.normal(size=(n, 4)) * (0.2 if k % 3 else 0.8)).astype(np.float32)
+        expected = twin.step(actions, table[k], lost)
+        _, reward, crashed, _, info = env.step(actions)
+        found = reward, info["stage_cost"], info["cost"], crashed
+        # sines turned by series: 1e-13 a step, which a tumbling vehicle amplifies
+        for ours, theirs in zip(found, expected, strict=True):
+            np.testing.assert_allclose(ours[flying], theirs[flying], rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(env.unwrapped.state[flying], twin.plants[flying], rtol=1e-8, atol=1e-9)
+        crashes += int((crashed & flying).sum())
+        flying &= ~crashed
+    assert crashes > n // 3
+
+
+def instructions(kernel, *arguments):
+    """Packed and scalar arithmetic on doubles in the machine code of a kernel, compiled anew."""
+    compiled = numba.jit(**kernel.entry.targetoptions)(kernel.py_func)
+    compiled(*arguments)
+    (code,) = compiled.inspect_asm().values()
+    operations = r"\bv(?:fn?m(?:add|sub)\w*|add|sub|mul|div|min|max|round|rndscale)"
+    return len(re.findall(operations + r"pd\b", code)), len(re.findall(operations + r"sd\b", code))
+
+
+@pytest.mark.skipif(not AVX, reason="the count is of x86-64 with AVX2")
+@pytest.mark.parametrize(
+    ("kernel", "rest", "packed"),
+    [
+        (calm_substep, (0.01,), 400),
+        (disturbed_substep, (0.01,), 450),
+        (arrive, (), 15),
+        (command, "task", 20),
+        (judge, "task", 100),
+    ],
+)
+def test_loops_over_lanes_are_vector_instructions(kernel, rest, packed):
+    task = task_vector(gym.make(HELIX).unwrapped.task, 5, 50.0)
+    w = np.zeros(N_FLIGHT if rest != "task" else N_TRACKING)
+    vector, scalar = instructions(kernel, w, *((task,) if rest == "task" else rest))
+    assert vector >= packed and scalar <= vector // 2
+
+
+@pytest.mark.parametrize("threads", [2, 3, 64])
+def test_rows_do_not_depend_on_the_number_of_threads(threads):
+    n = 6 * LANES + 1
+    options = {
+        "num_envs": n,
+        "randomize": 0.1,
+        "sensor_noise": 0.01,
+        "disturbance": "gusts",
+        "time_limit": 1.0,
+    }
+    one, many = (gym.make_vec(HELIX, **options, threads=count) for count in (1, threads))
+    many = copy.deepcopy(many)
+    rng = np.random.default_rng(0)
+    for first, second in zip(one.reset(seed=3), many.reset(seed=3), strict=True):
+        np.testing.assert_equal(first, second)
+    for _ in range(45):
+        actions = rng.uniform(-0.5, 0.5, (n, 4)).astype(np.float32)
+        for first, second in zip(one.step(actions), many.step(actions), strict=True):
+            np.testing.assert_equal(first, second)
+
+
+def test_an_action_that_is_no_number_moves_no_row_on_any_thread():
+    env = gym.make_vec(HELIX, num_envs=4 * LANES, threads=2)
+    env.reset(seed=0)
+    before, actions = env.unwrapped.state, np.zeros((4 * LANES, 4), np.float32)
+    actions[-1, 2] = np.nan
+    with pytest.raises(ValueError, match=r"action\[15, 2\] is nan"):
+        env.step(actions)
+    assert np.array_equal(env.unwrapped.state, before)
+
+
+@pytest.mark.parametrize("threads", [0, 1.5, True])
+def test_a_number_of_threads_that_is_none_is_refused(threads):
+    with pytest.raises(ValueError, match="threads"):
+        gym.make_vec(HELIX, num_envs=2, threads=threads)
+
+
+def test_one_flight_has_no_threads_to_choose():
+    with pytest.raises(TypeError, match=r"threads.*make_vec"):
+        gym.make(HELIX, threads=2)
+
+
+def test_blocks_read_what_was_written():
+    vehicles = Blocks(LANES + 2, N_FLIGHT)
+    vehicles.write(3 * LANES, np.array([1.0, 2.0]))
+    vehicles.write(3 * LANES, np.array([5.0, 6.0]), LANES + 1)
+    assert vehicles.read(3 * LANES, 2).tolist() == [[1.0, 2.0]] * (LANES + 1) + [[5.0, 6.0]]
+    assert vehicles.read(4 * LANES).tolist() == [2.0] * (LANES + 1) + [6.0]
