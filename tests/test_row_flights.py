@@ -1,12 +1,14 @@
 """Flights side by side in the rows of a vector environment, against the same flown one at a time."""
 
 import math
+import tracemalloc
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
 from baselines import PolicyError, evaluate, make_policy, measure, run_episodes
+from baselines.evaluation.amounts import _EPISODE_BYTES
 from baselines.evaluation.evaluate import fly_and_measure
 from baselines.evaluation.rollout import TIMED_STARTS, TIMED_STEPS, time_decisions
 from baselines.evaluation.row_forms import has_row_form, row_form
@@ -277,6 +279,19 @@ def test_rows_that_wait_do_not_change_what_is_kept():
     for flight, (states, rewards, references) in zip(flights, copies, strict=True):
         assert np.array_equal(flight.states, states) and np.array_equal(flight.rewards, rewards)
         assert np.array_equal(flight.references, references)
+
+
+def test_of_flights_that_ended_only_numbers_are_kept():
+    env = gym.make(HELIX)
+    policy = make_policy("hover", env)
+    timed, peaks = time_decisions(policy, env), []
+    for flights in (192, 448):  # of rows that fly several times
+        fly_and_measure(policy, env, flights, timed=timed)
+        tracemalloc.start()
+        fly_and_measure(policy, env, flights, timed=timed)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] - peaks[0] < 256 * _EPISODE_BYTES  # a flight as arrays has 70 kB
 
 
 class Remembers(TheirRows):
