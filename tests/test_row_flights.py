@@ -112,6 +112,7 @@ TEAMS = [
     (formation_v0, "random", {"terminate": "team", "vehicles": 3}),
     (target_tracking_v0, "random", {"vehicles": 3, "formation": "lattice"}),
     (cooperative_estimation_v0, "ekf", {}),
+    pytest.param(target_tracking_v0, "cooperative-mpc", {}, marks=pytest.mark.slow),  # it compiles for long
 ]
 
 
