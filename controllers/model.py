@@ -6,6 +6,8 @@ derivative itself is `quad_envs.dynamics.rigid_body`; nothing here writes it aga
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -26,6 +28,7 @@ from quad_envs.parameters import (
 from quad_envs.rotations import sincos
 
 from .qp.linalg import fill, matmul
+from .qp.vectors import WIDTH, add_scaled, entry, load, store, zero
 
 ZOH_SCRATCH = 3  # (12, 12) matrices that `zero_order_hold` needs
 RK4_SCRATCH = 52  # rows of 16 that `rk4_sensitivities` needs
@@ -179,16 +182,19 @@ def jacobian(x: Array, d: Array, c: Array, out: Array) -> None:
 @kernel
 def _horner_step(X: Array, S: Array, factor: float, out: Array) -> None:
     """I + factor X S, skipping the zeros of X (at least 106 of its 144 entries)."""
-    n = X.shape[0]
-    for i in range(n):
-        for j in range(n):
-            out[i, j] = 0.0
-        out[i, i] = 1.0
-        for k in range(n):
-            if X[i, k] != 0.0:
-                scaled = factor * X[i, k]
-                for j in range(n):
-                    out[i, j] += scaled * S[k, j]
+    for i in range(N_STATE):
+        t0, t1, t2 = zero(), zero(), zero()
+        for k in range(N_STATE):
+            x = entry(X, i, k)
+            if x != 0.0:
+                scaled = factor * x
+                t0 = add_scaled(t0, scaled, load(S, k, 0))
+                t1 = add_scaled(t1, scaled, load(S, k, WIDTH))
+                t2 = add_scaled(t2, scaled, load(S, k, 2 * WIDTH))
+        store(t0, out, i, 0)
+        store(t1, out, i, WIDTH)
+        store(t2, out, i, 2 * WIDTH)
+        out[i, i] += 1.0
 
 
 @kernel
@@ -244,19 +250,38 @@ def zero_order_hold(A_c: Array, B_c: Array, dt: float, A: Array, B: Array, scrat
             B[i, j] *= h
 
 
+@inline_kernel
+def _follow(
+    slope: Any, column: int, i: int, weight: float, ahead: float, V_total: Array, V_next: Array
+) -> None:
+    """Four entries of a row of `_step_sensitivities`, from their slope."""
+    store(add_scaled(load(V_total, i, column), weight, slope), V_total, i, column)
+    store(add_scaled(zero(), ahead, slope), V_next, i, column)
+
+
 @kernel
-def _sensitivity_slope(J: Array, V: Array, B_c: Array, out: Array) -> None:
-    """J V + [0 B_c], the slope of the sensitivities [dx/dx_0, dx/dF]; (12, 16)."""
+def _step_sensitivities(
+    J: Array, V: Array, B_c: Array, weight: float, ahead: float, V_total: Array, V_next: Array
+) -> None:
+    """V_total += weight S and V_next = [I 0] + ahead S, for the slope S = J V + [0 B_c] of V, (12, 16).
+
+    Of `jacobian` only the blocks are read that are not zero: (p; V_B, Theta), (V_B; V_B, Theta, Omega), (Theta;
+    Theta, Omega) and (Omega; Omega).
+    """
     for i in range(N_STATE):
-        for j in range(N_STATE):
-            out[i, j] = 0.0
-        for j in range(N_INPUT):
-            out[i, N_STATE + j] = B_c[i, j]
-        for k in range(3, N_STATE):  # nothing depends on the position
-            factor = J[i, k]
-            if factor != 0.0:
-                for j in range(N_STATE + N_INPUT):
-                    out[i, j] += factor * V[k, j]
+        first = 3 if i < 6 else (6 if i < 9 else 9)
+        s0, s1, s2, s3 = zero(), zero(), zero(), load(B_c, i, 0)
+        for k in range(first, 9 if i < 3 else N_STATE):
+            factor = entry(J, i, k)
+            s0 = add_scaled(s0, factor, load(V, k, 0))
+            s1 = add_scaled(s1, factor, load(V, k, WIDTH))
+            s2 = add_scaled(s2, factor, load(V, k, 2 * WIDTH))
+            s3 = add_scaled(s3, factor, load(V, k, 3 * WIDTH))
+        _follow(s0, 0, i, weight, ahead, V_total, V_next)
+        _follow(s1, WIDTH, i, weight, ahead, V_total, V_next)
+        _follow(s2, 2 * WIDTH, i, weight, ahead, V_total, V_next)
+        _follow(s3, 3 * WIDTH, i, weight, ahead, V_total, V_next)
+        V_next[i, i] += 1.0
 
 
 @kernel
@@ -287,7 +312,7 @@ def rk4_sensitivities(
         scratch: Overwritten, (RK4_SCRATCH, 16).
     """
     y, total, J = scratch[0, :N_STATE], scratch[1, :N_STATE], scratch[2:14, :N_STATE]
-    V, slope, V_total = scratch[14:26], scratch[26:38], scratch[38:50]
+    V, V_next, V_total = scratch[14:26], scratch[26:38], scratch[38:50]
     for i in range(N_STATE):
         y[i] = x[i]
         total[i] = 0.0
@@ -298,16 +323,13 @@ def rk4_sensitivities(
     for stage in range(4):
         k = rigid_body(y, F, d, c)  # type: ignore[arg-type]
         jacobian(y, d, c, J)
-        _sensitivity_slope(J, V, B_c, slope)
         weight = h / 6.0 if stage == 0 or stage == 3 else h / 3.0
         ahead = h if stage == 2 else 0.5 * h
         for i in range(N_STATE):
             total[i] += weight * k[i]
             y[i] = x[i] + ahead * k[i]
-            for j in range(N_STATE + N_INPUT):
-                V_total[i, j] += weight * slope[i, j]
-                V[i, j] = ahead * slope[i, j]
-            V[i, i] += 1.0
+        _step_sensitivities(J, V, B_c, weight, ahead, V_total, V_next)
+        V, V_next = V_next, V
     for i in range(N_STATE):
         x_next[i] = x[i] + total[i]
         for j in range(N_STATE):
