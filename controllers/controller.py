@@ -179,6 +179,11 @@ def first_non_finite(
     return -1
 
 
+def code_of_row(row: int) -> int:
+    """What the codes of `first_non_finite` are more where rows are counted from this one on."""
+    return len(_NAMES) * row
+
+
 def raise_non_finite(code: int) -> None:
     """Turn the result of `first_non_finite` into an error that names the argument and the row."""
     row, argument = divmod(code, len(_NAMES))

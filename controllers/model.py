@@ -265,8 +265,8 @@ def _step_sensitivities(
 ) -> None:
     """V_total += weight S and V_next = [I 0] + ahead S, for the slope S = J V + [0 B_c] of V, (12, 16).
 
-    Of `jacobian` only the blocks are read that are not zero: (p; V_B, Theta), (V_B; V_B, Theta, Omega), (Theta;
-    Theta, Omega) and (Omega; Omega).
+    Of `jacobian` only blocks that are not zero are read: (p; V_B, Theta), (V_B; V_B, Theta, Omega),
+    (Theta; Theta, Omega) and (Omega; Omega).
     """
     for i in range(N_STATE):
         first = 3 if i < 6 else (6 if i < 9 else 9)
@@ -311,7 +311,8 @@ def rk4_sensitivities(
         B: Result, d phi / dF, (12, 4).
         scratch: Overwritten, (RK4_SCRATCH, 16).
     """
-    y, total, J = scratch[0, :N_STATE], scratch[1, :N_STATE], scratch[2:14, :N_STATE]
+    y, total = scratch[0, :N_STATE], scratch[1, :N_STATE]
+    J = scratch[2:11].reshape(-1).reshape(N_STATE, N_STATE)
     V, V_next, V_total = scratch[14:26], scratch[26:38], scratch[38:50]
     for i in range(N_STATE):
         y[i] = x[i]

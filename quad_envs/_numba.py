@@ -37,13 +37,13 @@ Int = int | np.int64  # an argument that a kernel may be given as a constant, se
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def _compile(function: Function, inline: bool, fused: bool = False) -> Function:
+def _compile(function: Function, inline: bool, fused: bool = False, nogil: bool = False) -> Function:
     if getattr(config, "DISABLE_JIT", False):
         return function
     options: Any = {"error_model": "numpy", "fastmath": {"contract"} if fused else False}
     if NestedKernel is None:
-        return cast(Function, numba.njit(forceinline=inline, nogil=fused, **options)(function))
-    entry = cast(Any, numba.njit(nogil=fused, **options)(function))
+        return cast(Function, numba.njit(forceinline=inline, nogil=nogil, **options)(function))
+    entry = cast(Any, numba.njit(nogil=nogil, **options)(function))
     entry._cache = KernelCache(entry)
     return cast(Function, NestedKernel(function, entry, inline, options))
 
@@ -58,9 +58,14 @@ def inline_kernel(function: Function) -> Function:
     return _compile(function, inline=True)
 
 
+def threaded_kernel(function: Function) -> Function:
+    """As `kernel`, but threads may run it side by side."""
+    return _compile(function, inline=False, nogil=True)
+
+
 def lane_kernel(function: Function) -> Function:
     """As `kernel`, for loops over lanes: multiply-adds round once, and threads may run it side by side."""
-    return _compile(function, inline=False, fused=True)
+    return _compile(function, inline=False, fused=True, nogil=True)
 
 
 def inline_lane_kernel(function: Function) -> Function:

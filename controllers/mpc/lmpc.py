@@ -6,7 +6,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from quad_envs._numba import entry_of, kernel
+from quad_envs._numba import entry_of, threaded_kernel
 from quad_envs.parameters import ATTITUDE, Array
 from quad_envs.tasks import Task
 
@@ -43,7 +43,7 @@ class _Call(NamedTuple):
 _unpack = unpacker(_Call)
 
 
-@kernel
+@threaded_kernel
 def _decide_rows(
     plants: Array,
     windows: Array,

@@ -14,7 +14,14 @@ from quad_envs.limits import Limits
 from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, RATES, Array
 from quad_envs.tasks import BaseTask, Task
 
-from ..controller import Decision, as_one_row, as_rows, first_non_finite, raise_non_finite
+from ..controller import (
+    Decision,
+    as_one_row,
+    as_rows,
+    code_of_row,
+    first_non_finite,
+    raise_non_finite,
+)
 from ..disturbance import ESTIMATOR_SIZE, N_DISTURBANCE
 from ..fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXED_WEIGHT
 from ..frame import rotor_lag
@@ -37,6 +44,7 @@ from .kernels import (
     left_model,
 )
 from .options import PLAN_TILT, MpcOptions, VelocityAxes
+from .threads import Threads
 from .weights import change_weight, require_turnable, terminal_weight, weight_matrix
 
 PLAN_WEIGHT = 1e4  # per rad, rad/s: of rows that keep a plan in its model; 1e3 gives way to heavy positions
@@ -159,7 +167,8 @@ def mpc_data(task: BaseTask, options: MpcOptions, axes: VelocityAxes) -> MpcData
 class Mpc(ABC):
     """A flavour of MPC: makes the pairs of the OCP-QP, and inherits the rest.
 
-    Not for use by several threads at once: the scratch memory is shared.
+    Not for use by several threads at once: the scratch memory is shared. It starts those of `options.threads`
+    itself.
     """
 
     options: MpcOptions
@@ -178,7 +187,8 @@ class Mpc(ABC):
             1 + MEMORY_STAGE * self.horizon + (ESTIMATOR_SIZE if options.reject_disturbance else 0)
         )
         self.memory_size = self._keep_from + (1 + N_STATE * (self.horizon + 1) if guess else 0)
-        self._memory: _Memory | None = None
+        self._memories: list[_Memory] = []  # of each thread
+        self._threads = Threads(options.threads)
         self._backend: Backend | None = None
 
     def decide(
@@ -198,8 +208,7 @@ class Mpc(ABC):
             np.empty((3, n), np.int64),
         )
         if self.options.solver == "structured":
-            scratch = self._scratch()
-            bad = self._kernel(*arrays, command, kept, report, scratch.which, scratch.words)
+            bad = self._decide_rows(*arrays, command, kept, report)
         else:
             bad = self._decide_by_backend(*arrays, command, kept, report)
         if bad >= 0:
@@ -231,6 +240,23 @@ class Mpc(ABC):
         qp = qp._replace(rows=rows)
         return OcpQp._make(np.array(v) if isinstance(v, np.ndarray) else v for v in qp)
 
+    def _decide_rows(self, *arrays: Any) -> int:
+        """All rows, shared by the threads; -1, or the code of the first argument that is not finite."""
+        report, rows = arrays[-1], len(arrays[0])
+        if self._threads.count == 1 or rows == 1:
+            memory = self._scratch()
+            return self._kernel(*arrays, memory.which, memory.words)
+        memories = [self._scratch(thread) for thread in range(min(self._threads.count, rows))]
+
+        def work(thread: int, begin: int, end: int) -> int:
+            memory, found = memories[thread], np.empty((len(report), end - begin), np.int64)
+            share = (array[begin:end] for array in arrays[:-1])
+            code = self._kernel(*share, found, memory.which, memory.words)
+            report[:, begin:end] = found
+            return code if code < 0 else code + code_of_row(begin)
+
+        return self._threads.run(rows, work)
+
     @abstractmethod
     def _call(self, buffer: Array, ws: Workspace) -> Any:
         """What the kernel takes beside its rows, a NamedTuple for `pack`."""
@@ -246,16 +272,16 @@ class Mpc(ABC):
     def _keep(self, level: int, kept: Array, s: Scratch) -> None:  # noqa: B027  most flavours keep nothing
         """Write what the flavour remembers."""
 
-    def _scratch(self) -> _Memory:
-        """Scratch memory, made at need."""
-        if self._memory is None:
+    def _scratch(self, thread: int = 0) -> _Memory:
+        """Scratch memory of a thread, made at need."""
+        while len(self._memories) <= thread:
             which = np.zeros(1, np.int64) if self.options.reject_disturbance else None
             buffer = np.zeros(buffer_size(self.horizon, *self._sizes()))
             rows, weighs_changes = len(self._data.normal), len(self._data.R_rate) > 0
             ws = make_workspace(self.horizon, rows, self._pairs, weighs_changes)
             call = self._call(buffer, ws)
-            self._memory = _Memory(which, buffer, ws, call, pack(call))
-        return self._memory
+            self._memories.append(_Memory(which, buffer, ws, call, pack(call)))
+        return self._memories[thread]
 
     def _sizes(self) -> tuple[int, int, int, int]:
         """Pairs, outputs, rows, stages of the guess."""
@@ -347,4 +373,5 @@ class Mpc(ABC):
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but scratch memory and the backend's, which are made again when needed."""
-        return {**self.__dict__, "_memory": None, "_backend": None}
+        threads = Threads(self._threads.count)
+        return {**self.__dict__, "_memories": [], "_threads": threads, "_backend": None}

@@ -32,6 +32,7 @@ TerminalWeight = Literal["hover", "sdre"]
 PLAN_TILT = 0.8  # rad, of models linear in the attitude
 PLAN_TURN = 0.3  # rad, of roll and pitch from sample to sample
 EXACT_TILT = 1.0  # rad, of the exact model
+MOST_THREADS = 1024
 SOFT_WEIGHT = 25.0  # per SI unit: keeps the corridor's limits; from 30 on, 3 m outside walls, some flip
 
 
@@ -136,10 +137,16 @@ class MpcOptions(VehicleMpcOptions):
         # a sample in frame "heading", inf in "hover"
     )
 
+    threads: int = (
+        1  # threads that share the rows of a batch, more than one for many vehicles at once; decisions do not
+        # depend on it. Of the solver "structured"
+    )
+
     usual_tilt: ClassVar[float] = PLAN_TILT
 
     def __post_init__(self) -> None:
         VehicleMpcOptions.__post_init__(self)
+        require_whole("threads", self.threads, 1, MOST_THREADS)
         require_choice("solver", self.solver, SolverName)
         require_choice("frame", self.frame, Frame)
         for name, unit in (("plan_tilt", "rad"), ("plan_rate", "rad/s")):

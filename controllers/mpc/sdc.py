@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, NamedTuple
 
-from quad_envs._numba import entry_of, kernel
+from quad_envs._numba import entry_of, kernel, threaded_kernel
 from quad_envs.parameters import N_STATE, Array
 from quad_envs.tasks import Task
 
@@ -142,7 +142,7 @@ class _Call(NamedTuple):
 _unpack = unpacker(_Call)
 
 
-@kernel
+@threaded_kernel
 def _decide_rows(
     plants: Array,
     windows: Array,

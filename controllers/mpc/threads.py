@@ -1,0 +1,53 @@
+"""Threads that share the rows of a batch; what is decided for a row does not depend on their number."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
+
+_SHARE = 16  # rows at a time at most: a row with many active constraints takes longer than others
+
+
+class Threads:
+    """The calling thread and others beside it, which begin when they are first needed.
+
+    Args:
+        count: How many take part.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self._pool: ThreadPoolExecutor | None = None
+        self._process = 0  # to which the pool belongs: a fork has none of its threads
+
+    def run(self, rows: int, work: Callable[[int, int, int], int]) -> int:
+        """Let the threads work until all rows are done; each takes the next few when it has done its last.
+
+        Args:
+            rows: How many there are.
+            work: work(thread, begin, end) does these rows; -1, or a code >= 0 that ends it, larger for later
+                rows. A thread of a number does one thing at a time.
+
+        Returns:
+            -1, or the smallest code.
+        """
+        share = max(1, min(_SHARE, rows // (2 * self.count)))
+        begins = iter(range(0, rows, share))
+
+        def go(thread: int) -> int:
+            for begin in begins:
+                code = work(thread, begin, min(begin + share, rows))
+                if code >= 0:
+                    return code
+            return -1
+
+        if self._pool is None or self._process != os.getpid():
+            self._pool, self._process = ThreadPoolExecutor(self.count - 1, "decide"), os.getpid()
+        others = [self._pool.submit(go, thread) for thread in range(1, min(self.count, rows))]
+        try:
+            own = go(0)
+        finally:
+            wait(others)  # nobody still writes when this returns
+        codes = [own, *(other.result() for other in others)]
+        return min((code for code in codes if code >= 0), default=-1)
