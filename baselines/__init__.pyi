@@ -19,6 +19,7 @@ from .policies.protocol import Policy as Policy
 from .policies.protocol import PolicyState as PolicyState
 from .policies.registry import make_policy as make_policy
 from .policies.registry import policy_options as policy_options
+from .policies.registry import safe as safe
 from .policies.sb3_policy import sb3 as sb3
 from .policies.trained import load_policy as load_policy
 from .policies.trained import shipped_policies as shipped_policies

@@ -13,7 +13,10 @@ from .mpc.exact import ExactNmpc as ExactNmpc
 from .mpc.lmpc import LinearMPC as LinearMPC
 from .mpc.options import LmpcOptions as LmpcOptions
 from .mpc.options import NmpcOptions as NmpcOptions
+from .mpc.options import SafetyOptions as SafetyOptions
 from .mpc.options import SdcOptions as SdcOptions
+from .mpc.safety import Correction as Correction
+from .mpc.safety import SafetyFilter as SafetyFilter
 from .mpc.sdc import SdcNmpc as SdcNmpc
 from .qp import ocp as ocp
 from .qp import riccati as riccati

@@ -41,7 +41,11 @@ class EvaluateOptions:
 
     env: Annotated[str, Positional("environment id, as quad/HelixTracking-v0 or quad/Formation-v0")]
     policy: Annotated[
-        str, Positional("policy, as sdc-nmpc, the folder of a trained one, or module:factory of your own")
+        str,
+        Positional(
+            "policy, as sdc-nmpc, the folder of a trained one, or module:factory of your own; safe:NAME puts "
+            "a safety filter in front"
+        ),
     ]
     episodes: Annotated[int, "number of flights"] = 20
     seed: Annotated[int, "environment seed of the first flight"] = 0

@@ -27,11 +27,12 @@ class Mark(Flag):
     TIMED = auto()  # a quantile over all decisions, not averaged
     MOST = auto()  # the largest over flights, not averaged
     UNSEEN = auto()  # in files, not on the page
+    REPORTED = auto()  # only of policies that report it; in no table where none does
     PLAIN = 0  # none of these
 
 
 MORE, LESS, SINGLE, TEAM, LEAST, LARGEST, WORST, CUT_SHORT, COMPARED, PERCENT = list(Mark)[:10]
-COUNTED, FALLBACK, TIMED, MOST, UNSEEN = list(Mark)[10:]
+COUNTED, FALLBACK, TIMED, MOST, UNSEEN, REPORTED = list(Mark)[10:]
 _NOT_AVERAGED = COUNTED | FALLBACK | TIMED | MOST
 
 

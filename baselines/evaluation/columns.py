@@ -25,6 +25,7 @@ from .column import (
     MORE,
     MOST,
     PERCENT,
+    REPORTED,
     SINGLE,
     TEAM,
     TIMED,
@@ -131,6 +132,33 @@ class Record(NamedTuple):
     saturation_share: Annotated[
         float,
         Column("Saturated", "", "share of rotor commands at a face of their box", PERCENT, "saturated"),
+    ]
+    intervention_share: Annotated[
+        float,
+        Column(
+            *(
+                "Intervened",
+                "",
+                "share of commands that the safety filter changed",
+                LESS | PERCENT | REPORTED,
+            ),
+            "intervened",
+        ),
+    ]  # nan without a safety filter, as the next two
+    intervention_size: Annotated[
+        float,
+        Column(
+            *("Intervention", "N", "largest change of a rotor's command, mean over those", LESS | REPORTED),
+            "intervention",
+        ),
+    ]  # nan where none was changed
+    unanswered_share: Annotated[
+        float,
+        Column(
+            *("Unanswered", "", "share of commands of the filtered policy that were no numbers"),
+            LESS | PERCENT | REPORTED,
+            "unanswered",
+        ),
     ]
     decision_p50_ms: Annotated[
         float,
@@ -242,7 +270,8 @@ def fallbacks(counts: Mapping[str, Any]) -> int:
 
 
 # Columns that files of before do not have, or have under another name.
-_ADDED: Mapping[str, Any] = {"constraint_cost": math.nan, "crash_cause": "", "left_model": 0}
+_REPORTED = {name: math.nan for name, column in COLUMNS.items() if column.has(REPORTED)}
+_ADDED: Mapping[str, Any] = {"constraint_cost": math.nan, "crash_cause": "", "left_model": 0, **_REPORTED}
 _RENAMED = {"cost": "quadratic_cost"}
 
 

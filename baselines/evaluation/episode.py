@@ -15,7 +15,7 @@ from quad_envs.parameters import Array
 from quad_envs.tasks import BaseTask
 
 from ..errors import MissingPackageError
-from ..policies.protocol import Counts
+from ..policies.protocol import Counts, Interventions
 from .episode_columns import as_csv, episode_columns
 
 
@@ -49,6 +49,7 @@ class Episode(NamedTuple):
     team_size: int = 1  # vehicles that were decided for at once: the team took team_size * decision_times
     signals: Mapping[str, NDArray[Any]] = {}
     target: Array | None = None  # rows r, v of the team's target in all of the episode, (steps, 6)
+    interventions: Interventions | None = None  # of a safety filter, (1,) each
 
     def columns(self) -> dict[str, Array]:
         """Name -> (T+1,), the flight as a table: a row is a control period; see `episode_columns`."""

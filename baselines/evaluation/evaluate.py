@@ -17,7 +17,7 @@ from ..policies.environments import make_env
 from ..policies.outside import is_policy
 from ..policies.protocol import Policy
 from ..policies.registry import make_policy, policy_name
-from .column import CUT_SHORT
+from .column import CUT_SHORT, REPORTED
 from .columns import COLUMNS, Record, read_record
 from .episode import Episode
 from .metrics import (
@@ -161,6 +161,8 @@ class Evaluation:
 
     def _tells(self, name: str, values: Iterable[float]) -> bool:
         """Whether a column has anything to say: a number, or that a crash left none."""
+        if COLUMNS[name].has(REPORTED):
+            return any(map(math.isfinite, values))
         if not has_team(self.records):
             return True
         lost = COLUMNS[name].has(CUT_SHORT) and not name.startswith("estimate")

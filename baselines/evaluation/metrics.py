@@ -10,6 +10,7 @@ A team gives one record per vehicle. Its vehicles are averaged within a flight b
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
@@ -20,7 +21,7 @@ from quad_envs.constraints import TOLERANCE
 from quad_envs.parameters import POSITION, Array
 from quad_envs.tasks import TeamTask
 
-from .column import COUNTED, CUT_SHORT, FALLBACK
+from .column import COUNTED, CUT_SHORT, FALLBACK, REPORTED
 from .columns import COLUMNS, Record, averaged, renamed, without_cut_short
 from .episode import Episode
 from .team_metrics import by_flight, flight_values, has_team, measure_team
@@ -67,9 +68,23 @@ def measure(episode: Episode) -> Record:
         agent=episode.agent,
         crash_cause=episode.crash_cause,
         left_model=episode.left_model,
+        **_interventions(episode),
         **measure_team(episode),
     )
     return without_cut_short(record) if episode.crashed else record
+
+
+def _interventions(episode: Episode) -> dict[str, float]:
+    """What a safety filter did, nan without one."""
+    if episode.interventions is None:
+        return {column.name: math.nan for column in COLUMNS.values() if column.has(REPORTED)}
+    changed, total, unanswered = (float(part[0]) for part in episode.interventions)
+    steps, answered = len(episode.rewards), changed - unanswered
+    return {
+        "intervention_share": changed / steps,
+        "intervention_size": total / answered if answered else math.nan,
+        "unanswered_share": unanswered / steps,
+    }
 
 
 def _position_error(episode: Episode) -> Array:

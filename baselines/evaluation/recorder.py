@@ -12,7 +12,7 @@ from quad_envs.constraints import forces_from_actions
 from quad_envs.parameters import N_INPUT, Array
 from quad_envs.tasks import BaseTask, TeamTask
 
-from ..policies.protocol import N_FALLBACKS, PolicyState
+from ..policies.protocol import N_FALLBACKS, Interventions, PolicyState
 from .episode import Episode
 from .team_signals import TEAM_INFO, WRAPPER_INFO, estimate_signals
 
@@ -69,6 +69,7 @@ class Recorder:
         self._causes = np.zeros(n, dtype=np.int64)  # places in `task.crash_causes`
         self._fallbacks = np.zeros((n, N_FALLBACKS), dtype=np.int64)
         self._worst, self._left = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
+        self._interventions: Interventions | None = None
         self._signals: tuple[str, ...] = ()
 
     def begin(self, rows: Sequence[int], seeds: Sequence[int], begun: Begun) -> None:
@@ -129,6 +130,11 @@ class Recorder:
             np.copyto(self._worst, state.worst_iterations, where=live)
             if state.left_model is not None:
                 np.copyto(self._left, state.left_model, where=live)
+            if state.interventions is not None:
+                if self._interventions is None:
+                    self._interventions = Interventions._make(map(np.zeros_like, state.interventions))
+                for kept, found in zip(self._interventions, state.interventions, strict=True):
+                    np.copyto(kept, found, where=live)
         steps += live
         live &= ~(self._ends[1] | self._ends[2])
 
@@ -193,6 +199,8 @@ class Recorder:
             team_size=self.team_size,
             signals={name: kept[name][j, :steps].copy() for name in self._signals},
             target=None if self._targets is None else self._targets[j].copy(),
+            interventions=self._interventions
+            and Interventions._make(part[j : j + 1].copy() for part in self._interventions),
         )
 
     def _commands(self, actions: NDArray[Any]) -> Array:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from .column import COUNTED, Column
+from .column import COUNTED, REPORTED, Column
 
 
 def format_number(value: float, digits: int = 4) -> str:
@@ -84,7 +84,9 @@ def printed_table(
         for column in columns
         if column.printed
         and column.name in rows[0]
-        and not (drop_empty and not any(math.isfinite(row[column.name]) for row in rows))
+        and not (
+            (drop_empty or column.has(REPORTED)) and not any(math.isfinite(row[column.name]) for row in rows)
+        )
     ]
     header = [column.heading.format(base=base) for column in kept]
     return Table((), header, [[_cell(row, column) for column in kept] for row in rows])

@@ -49,14 +49,14 @@ def require_pair(policy: Any, env: Any, mismatch: bool = False) -> None:
 
     Args:
         policy: Anything with `predict`.
-        env: Of this suite, wrapped or not.
+        env: Of this suite, wrapped or not, or its task.
         mismatch: Whether the tasks may differ on purpose. Observations have to have the same layout.
 
     Raises:
         ValueError: If the tasks differ, with both values of the first fields that do; or if a wrapper changes
             the numbers, with its name.
     """
-    own, flown = getattr(policy, "task", None), find_task(env)
+    own, flown = getattr(policy, "task", None), env if isinstance(env, BaseTask) else find_task(env)
     if not isinstance(own, BaseTask):
         return
     _require_own_numbers(policy, env)

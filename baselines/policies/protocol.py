@@ -37,6 +37,14 @@ class Estimates(NamedTuple):
         )
 
 
+class Interventions(NamedTuple):
+    """What a safety filter did in this episode, one row per vehicle."""
+
+    changed: Counts  # (n,), commands that it changed, those without an answer among them
+    total: NDArray[np.float64]  # (n,), N, sum of the largest change of a rotor in each of these
+    unanswered: Counts  # (n,), commands that were not finite, and became the MPC's
+
+
 class PolicyState(NamedTuple):
     """What a policy carries from step to step, one row per vehicle. Callers pass it on, or read it."""
 
@@ -46,6 +54,8 @@ class PolicyState(NamedTuple):
     worst_iterations: Counts  # (n,), most iterations of a decision in this episode
     estimates: Estimates | None = None  # of policies that estimate a target
     left_model: Counts | None = None  # (n,), decisions of this episode outside their model; None: none
+    interventions: Interventions | None = None  # of safety filters
+    behind: Any = None  # state of the policy behind a safety filter
 
 
 @runtime_checkable

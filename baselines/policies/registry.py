@@ -20,6 +20,7 @@ from .protocol import Policy
 from .trained import load_policy, names_trained, shipped_policies
 
 if TYPE_CHECKING:  # not at run time: tasks load numba, and `quad-envs list` has to be quick
+    from controllers.mpc.options import SafetyOptions
     from quad_envs.tasks import BaseTask, Task, TeamTask
 
 
@@ -41,6 +42,7 @@ class PolicyEntry(NamedTuple):
     privileged: bool = False  # it sees `env.state()`: a yardstick, listed apart
 
 
+SAFE = "safe:"  # before the name of a policy: a safety filter stands in front of it
 _FORMATION, _TARGET, _ESTIMATION = "formation", "target-tracking", "estimation"
 TEAM_MISSIONS = (_FORMATION, _TARGET, _ESTIMATION)
 
@@ -161,13 +163,26 @@ def policy_entry(name: str, mission: str | None = None) -> PolicyEntry:
     return able[name]
 
 
+def behind_filter(name: str) -> str:
+    """The name of the policy behind a safety filter, `safe:NAME`; of any other, itself."""
+    return name.removeprefix(SAFE)
+
+
+def _is_filtered(source: Any) -> bool:
+    return isinstance(source, str) and source.startswith(SAFE)
+
+
 def is_trained(name: str | os.PathLike[str]) -> bool:
-    """Whether a name is that of a trained policy, and not of a controller."""
+    """Whether a name is that of a trained policy, filtered or not, and not of a controller."""
+    if _is_filtered(name):
+        return is_trained(behind_filter(str(name)))
     return not (name in TEAM_POLICIES | TRACKING_POLICIES or names_factory(name)) and names_trained(name)
 
 
 def from_outside(source: Any) -> bool:
     """Whether a policy, or its name, is none of this suite, whose own names go before others."""
+    if _is_filtered(source):
+        return from_outside(behind_filter(source))
     if isinstance(source, str) and (source in TEAM_POLICIES | TRACKING_POLICIES or is_trained(source)):
         return False
     return is_outside(source)
@@ -190,7 +205,7 @@ def policy_options(name: str) -> dict[str, Any]:
         ValueError: If the name is unknown.
         PolicyError: If it is one of the user's that cannot be imported.
     """
-    if from_outside(name):
+    if from_outside(name) and not _is_filtered(name):
         return outside_options(name)
     return {option: known.default for option, known in _known_options(name).items()}
 
@@ -201,8 +216,16 @@ def policy_comments(name: str) -> dict[str, str]:
     Raises:
         ValueError: If the name is unknown.
     """
+    if _is_filtered(name):
+        return field_comments(_filter_options())
     kind = None if from_outside(name) else _options_type(_factory(policy_entry(name)))
     return {} if kind is None else field_comments(kind)
+
+
+def _filter_options() -> type[SafetyOptions]:
+    from controllers.mpc.options import SafetyOptions
+
+    return SafetyOptions
 
 
 def _options_type(factory: Callable[..., Any]) -> type[Any] | None:
@@ -213,10 +236,11 @@ def _options_type(factory: Callable[..., Any]) -> type[Any] | None:
 
 def _known_options(name: str) -> dict[str, _Option]:
     """Of a policy: the fields of its options, or the parameters of its factory behind the task."""
-    factory = _factory(policy_entry(name))
-    kind = _options_type(factory)
+    factory = None if _is_filtered(name) else _factory(policy_entry(name))
+    kind = _filter_options() if factory is None else _options_type(factory)
     if kind is not None:
         return {field.name: _Option(field.default, str(field.type)) for field in fields(kind)}
+    assert factory is not None
     parameters = list(inspect.signature(factory).parameters.values())[1:]
     return {one.name: _Option(one.default, str(one.annotation)) for one in parameters}
 
@@ -247,7 +271,8 @@ def make_policy(name: str | os.PathLike[str] | Any, env: Any, **options: Any) ->
         name: One of TRACKING_POLICIES, or for a team one of TEAM_POLICIES; or a trained policy: the folder
             of its training, or the name of a shipped one; or one of the user's: `module:factory`, the name of
             an entry point, a factory, or a policy. A factory is called with the task, or with the environment
-            if its first parameter is called `env`.
+            if its first parameter is called `env`. `safe:` before a name puts a safety filter in front, see
+            `safe`; options are then those of the filter.
         env: An environment (wrapped or not), a vector environment, an id, or a Task. Only its Task is used.
         options: Of the policy, see `policy_options`; MPCs take `horizon`, `solver` and what their chapter
             offers. A horizon that is not given is 25, or the preview of the task where that is shorter.
@@ -261,6 +286,8 @@ def make_policy(name: str | os.PathLike[str] | Any, env: Any, **options: Any) ->
     """
     from .environments import environment_of, task_of
 
+    if _is_filtered(name):
+        return safe(behind_filter(str(name)), env, **options)
     if from_outside(name):
         made: Policy = build(name, lambda: task_of(env), lambda: environment_of(env), options)
         return made
@@ -270,16 +297,58 @@ def make_policy(name: str | os.PathLike[str] | Any, env: Any, **options: Any) ->
         return load_policy(name, env)
     name = str(name)
     known = _known_options(name)
-    for option, value in options.items():
-        if option not in known:
-            raise ValueError(unknown_name(f"option of policy {name!r}:", option, known))
-        _check_kind(name, option, known[option], value)
+    _check_options(name, known, options)
     defaults = {option: each.default for option, each in known.items()}
     task: BaseTask = task_of(env)
     factory = _factory(policy_entry(name, task.mission))
     if task.mission in TEAM_MISSIONS:
         return _make_team_policy(name, factory, cast("TeamTask", task), defaults, options)
     return _make_tracking_policy(name, factory, cast("Task", task), defaults, options)
+
+
+def safe(policy: str | os.PathLike[str] | Any, env: Any, **options: Any) -> Policy:
+    """A policy behind a predictive safety filter, so that it keeps the limits of its task.
+
+    Each command, within rate limit and rotor box, is kept as far as an MPC with hard limits can go on from
+    it, see `controllers.SafetyFilter`. Where the policy answers with NaN the MPC's own command is taken.
+
+    Args:
+        policy: Anything with `predict`, or what `make_policy` takes: a name, a folder, `module:factory`.
+        env: As for `make_policy`.
+        options: Of the filter, see `controllers.SafetyOptions`: `margin`, `weight`, `horizon`,
+            `reject_disturbance`, ... A horizon that is not given is 25, or the preview where that is shorter.
+
+    Raises:
+        ValueError: If the task has no limits or several vehicles, the policy is filtered already, or an
+            option is not allowed.
+    """
+    from .environments import task_of
+    from .safe import SafePolicy, task_to_keep
+
+    task = task_to_keep(task_of(env))
+    if isinstance(policy, str) and _is_filtered(policy):
+        raise ValueError(f"policy {policy!r} has a safety filter already: one is enough, name it without")
+    known = _known_options(SAFE)
+    _check_options(f"{SAFE}NAME", known, options)
+    preview = task.layout.preview
+    options.setdefault("horizon", min(known["horizon"].default, max(preview, 1)))
+    kind = _filter_options()
+    if isinstance(options["horizon"], int) and options["horizon"] > preview:
+        raise ValueError(
+            f"a safety filter looks {options['horizon']} steps ahead, the observation {preview}: choose "
+            f"horizon <= {preview}, or gym.make({task.env_id!r}, preview={options['horizon']})"
+        )
+    made = make_policy(policy, env)
+    name = os.fspath(policy) if isinstance(policy, str | os.PathLike) else policy_name(made)
+    return SafePolicy(made, task, kind(**options), name)
+
+
+def _check_options(name: str, known: Mapping[str, _Option], options: Mapping[str, Any]) -> None:
+    """Refuse options that a policy does not have, and values of another kind."""
+    for option, value in options.items():
+        if option not in known:
+            raise ValueError(unknown_name(f"option of policy {name!r}:", option, known))
+        _check_kind(name, option, known[option], value)
 
 
 def _built(name: str, factory: Callable[..., Any], task: BaseTask, options: Mapping[str, Any]) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -120,6 +120,16 @@ def encode_commands(
         new_left[j] = left[j] + (0 if start[j] else times_left[j])
 
 
+class Seen(NamedTuple):
+    """What a call of `predict` was given, checked."""
+
+    obs: Actions  # (n, d)
+    one: bool  # whether it was a single observation
+    start: NDArray[np.bool_]  # (n,)
+    state: PolicyState
+    arguments: tuple[Array, Array, Array, Array, Array]  # of `Controller.decide`
+
+
 class ControllerPolicy:
     """A controller as a policy for tracking observations.
 
@@ -151,6 +161,15 @@ class ControllerPolicy:
         Raises:
             ValueError: If a shape is wrong or an observation is not finite; it names the part.
         """
+        seen = self._read(observation, state, episode_start)
+        decision = self.controller.decide(*seen.arguments)
+        actions, kept = self._answer(seen, decision)
+        return actions[0] if seen.one else actions, kept
+
+    def _read(
+        self, observation: NDArray[Any], state: PolicyState | None, episode_start: ArrayLike | None
+    ) -> Seen:
+        """The arguments of `predict` as those of `Controller.decide`."""
         obs, one = as_rows(observation, self._size)
         n = obs.shape[0]
         start = as_starts(episode_start, n)
@@ -161,7 +180,11 @@ class ControllerPolicy:
         if code >= 0:
             raise not_finite(obs, code, self.task.layout.slices)
         memory = state.memory if code == -1 else np.where(start[:, None], 0.0, state.memory)
-        decision = self.controller.decide(plants, windows, lasts, disturbances, memory)
+        return Seen(obs, one, start, state, (plants, windows, lasts, disturbances, memory))
+
+    def _answer(self, seen: Seen, decision: Decision) -> tuple[Actions, PolicyState]:
+        """Actions of a decision, (n, 4), and the state to pass on."""
+        n = seen.obs.shape[0]
         actions = np.empty((n, 4), dtype=np.float32)
         counts, worst = np.empty((n, N_FALLBACKS), dtype=np.int64), np.empty(n, dtype=np.int64)
         left = np.empty(n, dtype=np.int64)
@@ -170,10 +193,10 @@ class ControllerPolicy:
             decision.fallback,
             decision.iterations,
             _zeros(n) if decision.left_model is None else decision.left_model,
-            start,
-            state.fallbacks,
-            state.worst_iterations,
-            times_left(state),
+            seen.start,
+            seen.state.fallbacks,
+            seen.state.worst_iterations,
+            times_left(seen.state),
             self._hover,
             self._force_max,
             actions,
@@ -181,8 +204,7 @@ class ControllerPolicy:
             worst,
             left,
         )
-        kept = PolicyState(decision.memory, counts, decision.iterations, worst, left_model=left)
-        return actions[0] if one else actions, kept
+        return actions, PolicyState(decision.memory, counts, decision.iterations, worst, left_model=left)
 
 
 class Hover:

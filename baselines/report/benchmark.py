@@ -16,7 +16,7 @@ from ..evaluation.amounts import require_jobs
 from ..files import locked, write_atomic
 from ..policies.environments import make_env
 from ..policies.outside import name_of
-from ..policies.registry import from_outside, is_trained, make_policy, policy_entry
+from ..policies.registry import behind_filter, from_outside, is_trained, make_policy, policy_entry
 from ..sweeps.comparison import Results
 from ..sweeps.engines import check_engine
 from ..sweeps.finished import training_plan
@@ -138,6 +138,6 @@ def _refuse_bad_policy(unit: Unit, env: Any) -> None:
         make_policy(unit.source, env, **unit.policy.kwargs)
     except ValueError as error:
         known = from_outside(unit.source) or is_trained(unit.source)
-        if known or env.unwrapped.task.mission in policy_entry(unit.source).missions:
+        if known or env.unwrapped.task.mission in policy_entry(behind_filter(unit.source)).missions:
             raise
         raise ValueError(f"{error}. Say in the suite for which it is: envs = [...]") from error

@@ -21,7 +21,7 @@ from ..evaluation.metrics import summarize, totals, worst_violations
 from ..evaluation.statistics import Comparison, Interval, compare
 from ..evaluation.table import Table, printed_table
 from ..evaluation.team_metrics import flight_values
-from ..policies.registry import from_outside
+from ..policies.registry import behind_filter, from_outside
 from ..training.algorithms import ALGORITHMS
 from .suite import PolicyChoice, Suite, is_for
 from .units import Unit, training_units
@@ -144,7 +144,8 @@ def find_contenders(
 def _kind(policy: PolicyChoice) -> str:
     if policy.train is not None or policy.shipped:
         return ALGORITHMS[policy.name].kind
-    return "outside" if ":" in policy.name or from_outside(policy.name) else "controller"
+    name = behind_filter(policy.name)
+    return "outside" if ":" in name or from_outside(name) else "controller"
 
 
 def contender_rows(contenders: Sequence[Contender], base: str) -> list[dict[str, Any]]:

@@ -13,6 +13,8 @@ kwargs = {horizon = 15}
 [[policies]]
 name = "mypolicy:make"       # module:factory of your own, or an entry point of an installed package
 [[policies]]
+name = "safe:ppo-corridor"   # behind a safety filter
+[[policies]]
 name = "ppo"                 # an algorithm: one network is trained in each environment and with each seed
 train = {seeds = [0, 1, 2], steps = 4_000_000}
 [[policies]]
@@ -38,7 +40,7 @@ from typing import Any, TypeVar
 from quad_envs.names import shown, unknown_name
 from quad_envs.registration import TEAMS, TRACKING
 
-from ..policies.registry import TEAM_POLICIES, TRACKING_POLICIES, from_outside
+from ..policies.registry import TEAM_POLICIES, TRACKING_POLICIES, behind_filter, from_outside
 from ..policies.trained import names_trained
 from ..training.algorithms import ALGORITHMS
 from .suite import Condition, EnvChoice, PolicyChoice, Suite, Training
@@ -108,8 +110,11 @@ def _checked(table: dict[str, Any], kind: type[Any], suite: str) -> dict[str, An
     if table.get("train", 0) is None:
         del table["train"]
     allowed = _allowed(kind, table)
-    if allowed is not None and table[key] not in allowed and not _is_users(kind, table[key]):
-        raise ValueError(unknown_name(f"{key} in suite {suite!r}:", table[key], allowed))
+    name = table[key]
+    if kind is PolicyChoice and not ("train" in table or table.get("shipped")):
+        name = behind_filter(name)
+    if allowed is not None and name not in allowed and not _is_users(kind, name):
+        raise ValueError(unknown_name(f"{key} in suite {suite!r}:", name, allowed))
     if not isinstance(table.get("kwargs", {}), Mapping):
         raise ValueError(
             f"suite {suite!r}: kwargs of {table[key]!r} must be a table, as {{horizon = 15}}, "

@@ -279,6 +279,39 @@ class ScoreNmpcOptions(NmpcOptions):
     margin: float = 0.022  # as of `MpcOptions`; at 0.02, one start in forty exceeds a tilt by 0.002 rad
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SafetyOptions(NmpcOptions):
+    """What `SafetyFilter` lets choose."""
+
+    soft_weight: float = math.inf  # exact penalty per unit of a state row; inf: hard, soft where they must be
+    weight: float = (
+        50.0  # per N^2, of a change of the wanted command beside the weights of the MPC: the larger, the
+        # later and the harder the filter intervenes
+    )
+
+    def __post_init__(self) -> None:
+        NmpcOptions.__post_init__(self)
+        if not 0.0 < self.weight < math.inf:
+            raise ValueError(f"weight must be a finite number > 0, per N^2, got {shown(self.weight)}")
+        if self.horizon < 2:
+            raise ValueError(
+                f"horizon of a safety filter must be at least 2 samples, got {self.horizon}: raise it, and "
+                "the preview of the environment"
+            )
+        if self.objective != "cost":
+            raise ValueError(
+                f"a safety filter plans with objective='cost' alone, got {shown(self.objective)}: for a plan "
+                "of the score, filter score-nmpc"
+            )
+        if self.solver != "structured":
+            raise ValueError(f"a safety filter has solver='structured' alone, got {shown(self.solver)}")
+        if self.R_rate is not None:
+            raise ValueError(
+                "R_rate weighs changes of the command, which a safety filter leaves to whom it filters: "
+                "leave it out"
+            )
+
+
 _Options = TypeVar("_Options", bound="DataclassInstance")
 
 
