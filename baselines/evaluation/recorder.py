@@ -23,6 +23,7 @@ INFO = (
     "crashed",
     "crash_cause",
 )  # keys that every environment of the suite tells
+_SCORED = ("rewards", *SCORES, "seconds")  # columns of what is stored as one array
 _BEHIND = 2  # places behind the last step of an episode: the plant at its end, and what rows that wait say
 
 
@@ -62,7 +63,7 @@ class Recorder:
         self.steps = np.zeros(n, dtype=np.int64)  # flown of the present episodes
         self._rows = np.arange(n)
         self._room, self._longest = task.episode_steps + _BEHIND, 0
-        self._kept: dict[str, NDArray[Any]] = {}  # name -> (n, room, ...), what is said of each step
+        self._kept: dict[str, NDArray[Any]] = {}  # name -> (room, n, ...), what is said of each step
         self._references: list[NDArray[Any]] = [np.zeros((0, 0))] * n
         self._targets: Array | None = None
         self._ends = np.zeros((3, n), dtype=np.bool_)  # crashed, terminated, truncated
@@ -90,7 +91,7 @@ class Recorder:
             if self._targets is None:
                 self._targets = np.zeros_like(begun.targets)
             self._targets[which] = begun.targets[which]
-        self._room_for("plants", begun.plants)[which, 0] = begun.plants[which]
+        self._room_for("plants", begun.plants)[0, which] = begun.plants[which]
 
     def add(
         self,
@@ -111,17 +112,25 @@ class Recorder:
             seconds: Wall time of the decision per vehicle.
             plants: After the step, (n, 16).
         """
-        live, info, steps = self.live, said.info, self.steps
+        live, info = self.live, said.info
         self._longest += 1
         if self._longest + _BEHIND > self._room:
             self._grow()
+        now, then = self._place(0), self._place(1)
         signals = self._signals_of(observations, state, actions, info)
         self._signals = tuple(signals)
-        told = {key: info[key] for key in (*SCORES, "constraint_values")} | signals
-        told |= {"actions": actions, "rewards": said.rewards, "seconds": np.full(len(live), seconds)}
+        scores = np.empty(
+            (len(live), len(_SCORED))
+        )  # one array, since each takes as long to store as another
+        scores.T[:] = (said.rewards, *(info[key] for key in SCORES), np.broadcast_to(seconds, live.shape))
+        told = {
+            "scores": scores,
+            "constraint_values": info["constraint_values"],
+            "actions": actions,
+        } | signals
         for name, values in told.items():
-            self._room_for(name, values)[self._rows, steps] = values
-        self._room_for("plants", plants)[self._rows, steps + 1] = plants
+            self._room_for(name, values)[now] = values
+        self._room_for("plants", plants)[then] = plants
         for end, values in zip(self._ends, (info["crashed"], said.terminated, said.truncated), strict=True):
             np.copyto(end, values, where=live)
         np.copyto(self._causes, info["crash_cause"], where=live)
@@ -135,7 +144,7 @@ class Recorder:
                     self._interventions = Interventions._make(map(np.zeros_like, state.interventions))
                 for kept, found in zip(self._interventions, state.interventions, strict=True):
                     np.copyto(kept, found, where=live)
-        steps += live
+        self.steps += live
         live &= ~(self._ends[1] | self._ends[2])
 
     def _signals_of(
@@ -145,17 +154,22 @@ class Recorder:
         told = {key: info[key] for key in TEAM_INFO if key in info}
         if self._targets is not None and isinstance(self.task, TeamTask):
             at = np.minimum(self.steps, self._targets.shape[1] - 1)
-            truth, plants = self._targets[self._rows, at], self._kept["plants"][self._rows, self.steps]
+            truth, plants = self._targets[self._rows, at], self._kept["plants"][self._place(0)]
             told |= estimate_signals(self.task, state, observations, actions, plants, truth)
             if "nis" in info and "nis" in told and np.isnan(told["nis"]).all():
                 told |= {key: info[key] for key in WRAPPER_INFO}
         return told
 
+    def _place(self, later: int) -> Any:
+        """Where what is said of every row belongs; one slice, which is quick, where all are at one step."""
+        first = self.steps[0] + later
+        return first if (self.steps == self.steps[0]).all() else (self.steps + later, self._rows)
+
     def _room_for(self, name: str, values: NDArray[Any]) -> NDArray[Any]:
-        """Where values of a name are kept, (n, room, ...), in a type that holds them and those before."""
+        """Where values of a name are kept, (room, n, ...), in a type that holds them and those before."""
         kept = self._kept.get(name)
         if kept is None:
-            kept = self._kept[name] = np.zeros((len(self._rows), self._room, *values.shape[1:]), values.dtype)
+            kept = self._kept[name] = np.zeros((self._room, *values.shape), values.dtype)
         elif kept.dtype != values.dtype and not np.can_cast(values.dtype, kept.dtype):
             kept = self._kept[name] = kept.astype(np.result_type(kept, values))
         return kept
@@ -164,7 +178,7 @@ class Recorder:
         """Make room for an episode that is longer than its task says."""
         self._room *= 2
         for name, kept in self._kept.items():
-            self._kept[name] = np.concatenate([kept, np.zeros_like(kept)], axis=1)
+            self._kept[name] = np.concatenate([kept, np.zeros_like(kept)])
 
     def episodes(self, rows: Sequence[int]) -> list[Episode]:
         """The flights of some rows as arrays of their own."""
@@ -173,21 +187,20 @@ class Recorder:
     def _episode(self, j: int) -> Episode:
         steps, kept = int(self.steps[j]), self._kept
 
-        def real(name: str) -> Array:
-            return kept[name][j, :steps].astype(np.float64)
+        scores = dict(zip(_SCORED, kept["scores"][:steps, j].T.copy(), strict=True))
 
         return Episode(
             task=self.task,
             seed=self.seeds[j],
-            states=kept["plants"][j, : steps + 1].copy(),
+            states=kept["plants"][: steps + 1, j].copy(),
             references=self._references[j][: steps + 1].copy(),
-            commands=self._commands(kept["actions"][j, :steps]),
-            rewards=real("rewards"),
-            stage_costs=real("stage_cost"),
-            costs=real("cost"),
-            violations=real("constraint_violation") > 0.0,
-            constraint_values=real("constraint_values"),
-            decision_times=real("seconds"),
+            commands=self._commands(kept["actions"][:steps, j]),
+            rewards=scores["rewards"],
+            stage_costs=scores["stage_cost"],
+            costs=scores["cost"],
+            violations=scores["constraint_violation"] > 0.0,
+            constraint_values=kept["constraint_values"][:steps, j].astype(np.float64),
+            decision_times=scores["seconds"],
             fallbacks=self._fallbacks[j].copy(),
             worst_iterations=int(self._worst[j]),
             crashed=bool(self._ends[0, j]),
@@ -197,7 +210,7 @@ class Recorder:
             crash_cause=self.task.crash_causes[self._causes[j]],
             left_model=int(self._left[j]),
             team_size=self.team_size,
-            signals={name: kept[name][j, :steps].copy() for name in self._signals},
+            signals={name: kept[name][:steps, j].copy() for name in self._signals},
             target=None if self._targets is None else self._targets[j].copy(),
             interventions=self._interventions
             and Interventions._make(part[j : j + 1].copy() for part in self._interventions),
