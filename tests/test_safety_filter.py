@@ -137,6 +137,10 @@ def test_options_are_those_of_the_filter():
         make_policy("safe:nmpc", CORRIDOR, margn=0.05)
     with pytest.raises(ValueError, match="weight must be"):
         make_policy("safe:nmpc", CORRIDOR, weight=0.0)
+    with pytest.raises(ValueError, match="one thread"):
+        make_policy("safe:nmpc", CORRIDOR, threads=2)
+    with pytest.raises(ValueError, match="objective"):
+        make_policy("safe:nmpc", CORRIDOR, objective="score")
     with pytest.raises(ValueError, match="R_rate"):
         make_policy("safe:nmpc", CORRIDOR, R_rate=1.0)
     with pytest.raises(ValueError, match="preview=30"):

@@ -305,6 +305,10 @@ class SafetyOptions(NmpcOptions):
             )
         if self.solver != "structured":
             raise ValueError(f"a safety filter has solver='structured' alone, got {shown(self.solver)}")
+        if self.threads != 1:
+            raise ValueError(
+                f"a safety filter decides in one thread, got threads={self.threads}: leave it out"
+            )
         if self.R_rate is not None:
             raise ValueError(
                 "R_rate weighs changes of the command, which a safety filter leaves to whom it filters: "
