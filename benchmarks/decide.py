@@ -1,9 +1,10 @@
-"""Decision times in closed loop: `python -m benchmarks.decide [--horizons 5 10 25 45] [--quick] [--json]`.
+"""Decision times in closed loop: `python -m benchmarks.decide [--quick] [--beside CHECKOUT] [--json]`.
 
 Every controller decides through `predict` in two flights: "nominal" (a climbing helix, no constraint active)
 and "tight" (set-point jumps with 2.45 N rotors and 5 N/s, many active). All fly in turns, flight by flight,
 in one run. The time of a decision is the smallest over the repetitions of its flight, which repeat exactly;
-p50, p99 and max are over the decisions. The quadratic cost is that of the closed loop. DAQP and CasADi-IPOPT
+p50, p99 and max are over the decisions. With `--beside CHECKOUT` single and batched decisions of another
+checkout fly in turns with ours. The quadratic cost is that of the closed loop. DAQP and CasADi-IPOPT
 fly along when they are installed.
 """
 
@@ -14,8 +15,10 @@ import importlib.util
 import json
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
+from .beside import Pair, decisions_beside
 from .timing import machine, one_thread, quantiles
 
 one_thread()
@@ -177,7 +180,11 @@ def main() -> None:
     parser.add_argument("--repetitions", type=int, default=5)
     parser.add_argument("--quick", action="store_true", help="N = 25 only, two repetitions")
     parser.add_argument("--json", action="store_true", help="machine-readable")
+    parser.add_argument("--beside", type=Path, help="another checkout: only this", metavar="CHECKOUT")
     arguments = parser.parse_args()
+    if arguments.beside is not None:
+        _print_beside(decisions_beside(arguments.beside, 64, 40, arguments.repetitions))
+        return
     horizons, repetitions = ([25], 2) if arguments.quick else (arguments.horizons, arguments.repetitions)
     results: dict[str, dict[str, Any]] = {}
     if not arguments.json:
@@ -196,6 +203,13 @@ def main() -> None:
     print("\none batched predict over 256 vehicles, N = 25, tight:")
     for name, value in rate.items():
         print(f"  {name}: {value:,.0f} decisions/s")
+
+
+def _print_beside(found: dict[str, Pair]) -> None:
+    rows = [
+        [name, f"{here:.1f}", f"{there:.1f}", f"{there / here:.2f}"] for name, (here, there) in found.items()
+    ]
+    print(format_table(["policy, scene, rows at once; N = 25", "us a row", "there", "there / here"], rows))
 
 
 def _print(title: str, found: dict[str, Result]) -> None:
