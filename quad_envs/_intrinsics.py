@@ -1,4 +1,4 @@
-"""What numba does not offer: vector registers where loops are too short, and arrays at an address.
+"""What numba does not offer: vector registers where loops are too short, and views that nobody counts.
 
 Numba runs LLVM without the pass that puts neighbouring assignments together. Each function has a twin for
 kernels that run as plain Python (NUMBA_DISABLE_JIT).
@@ -6,7 +6,6 @@ kernels that run as plain Python (NUMBA_DISABLE_JIT).
 
 from __future__ import annotations
 
-import ctypes
 from typing import Any
 
 import numpy as np
@@ -40,28 +39,6 @@ def _take_nearer(places: Array, at: int, x: float, y: float, z: float) -> None:
 def _borrowed(array: Any) -> Any:
     """The same array, of which references are not counted: whoever called the kernel keeps it."""
     return array
-
-
-def _floats_at(address: int) -> Any:
-    """Pointer to float64 numbers, for `numba.carray`."""
-    return ctypes.cast(int(address), ctypes.POINTER(ctypes.c_double))
-
-
-def _integers_at(address: int) -> Any:
-    """Pointer to int64 numbers, for `numba.carray`."""
-    return ctypes.cast(int(address), ctypes.POINTER(ctypes.c_int64))
-
-
-def _pointer(element: Any) -> Any:
-    """The intrinsic that takes an address as a pointer to such elements."""
-
-    def at(typing: Any, address: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            return builder.inttoptr(arguments[0], context.get_value_type(element).as_pointer())
-
-        return types.CPointer(element)(types.intp), generate
-
-    return intrinsic(at)
 
 
 def _without_count(typing: Any, array: Any) -> Any:
@@ -137,8 +114,7 @@ take_nearer: Any
 borrowed: Any
 if getattr(config, "DISABLE_JIT", False):
     take_nearer = _take_nearer
-    write_stage, borrowed, floats_at, integers_at = _write_stage, _borrowed, _floats_at, _integers_at
+    write_stage, borrowed = _write_stage, _borrowed
 else:
     write_stage, borrowed = intrinsic(_in_registers), intrinsic(_without_count)
     take_nearer = intrinsic(_nearer_in_registers)
-    floats_at, integers_at = _pointer(types.float64), _pointer(types.int64)

@@ -9,7 +9,9 @@ import numba
 import numpy as np
 import pytest
 
-from quad_envs import Steady
+from quad_envs import Gusts, Steady
+from quad_envs._intrinsics import take_nearer
+from quad_envs._numba import kernel
 from quad_envs.constraints import (
     TOLERANCE,
     constraint_scales,
@@ -28,8 +30,10 @@ from quad_envs.envs.shared.task_vector import task_vector
 from quad_envs.envs.shared.vehicle_options import CRASH_TILT
 from quad_envs.envs.tracking.kernel import command, judge
 from quad_envs.lanes import LANES, N_FLIGHT, N_TRACKING, Blocks
+from quad_envs.references import Heading, Racetrack, RandomSmooth
 from quad_envs.reward import stage_cost
-from quad_envs.turning import with_turn_rates
+from quad_envs.table_row import N_TABLE
+from quad_envs.turning import tabulate, with_turn_rates
 
 HELIX = "quad/HelixTracking-v0"
 LIMITS = {
@@ -123,18 +127,18 @@ def test_lanes_fly_as_the_readable_equations_over_random_episodes_with_crashes(a
     assert crashes > n // 3
 
 
-def instructions(kernel, *arguments):
+def instructions(compiled, *arguments):
     """Packed and scalar arithmetic on doubles in the machine code of a kernel, compiled anew."""
-    compiled = numba.jit(**kernel.entry.targetoptions)(kernel.py_func)
-    compiled(*arguments)
-    (code,) = compiled.inspect_asm().values()
+    anew = numba.jit(**compiled.entry.targetoptions)(compiled.py_func)
+    anew(*arguments)
+    (code,) = anew.inspect_asm().values()
     operations = r"\bv(?:fn?m(?:add|sub)\w*|add|sub|mul|div|min|max|round|rndscale)"
     return len(re.findall(operations + r"pd\b", code)), len(re.findall(operations + r"sd\b", code))
 
 
 @pytest.mark.skipif(not AVX, reason="the count is of x86-64 with AVX2")
 @pytest.mark.parametrize(
-    ("kernel", "rest", "packed"),
+    ("compiled", "rest", "packed"),
     [
         (calm_substep, (0.01,), 400),
         (disturbed_substep, (0.01,), 450),
@@ -143,10 +147,10 @@ def instructions(kernel, *arguments):
         (judge, "task", 100),
     ],
 )
-def test_loops_over_lanes_are_vector_instructions(kernel, rest, packed):
+def test_loops_over_lanes_are_vector_instructions(compiled, rest, packed):
     task = task_vector(gym.make(HELIX).unwrapped.task, 5, 50.0)
     w = np.zeros(N_FLIGHT if rest != "task" else N_TRACKING)
-    vector, scalar = instructions(kernel, w, *((task,) if rest == "task" else rest))
+    vector, scalar = instructions(compiled, w, *((task,) if rest == "task" else rest))
     assert vector >= packed and scalar <= vector // 2
 
 
@@ -198,3 +202,58 @@ def test_blocks_read_what_was_written():
     vehicles.write(3 * LANES, np.array([5.0, 6.0]), LANES + 1)
     assert vehicles.read(3 * LANES, 2).tolist() == [[1.0, 2.0]] * (LANES + 1) + [[5.0, 6.0]]
     assert vehicles.read(4 * LANES).tolist() == [2.0] * (LANES + 1) + [6.0]
+
+
+@kernel
+def _nearest(places, points):
+    for i in range(len(points)):
+        take_nearer(places, np.int64(0), points[i, 0], points[i, 1], points[i, 2])
+
+
+def test_four_places_take_the_squared_distance_of_the_nearest_point():
+    rng = np.random.default_rng(0)
+    places, points = rng.normal(size=(4, 4)), rng.normal(size=(7, 3))
+    places[3] = np.inf
+    expected = ((places[:3].T[:, None] - points) ** 2).sum(axis=2).min(axis=1)
+    block = places.ravel().copy()
+    _nearest(block, points)
+    np.testing.assert_allclose(block[12:], expected, rtol=1e-15)
+    assert np.array_equal(block[:12], places[:3].ravel())
+
+
+def test_gusts_are_first_order_gauss_markov_processes_that_join_from_step_to_step():
+    gusts = Gusts(force=(0.1, 0.2, 0.3), torque=0.02, correlation_time=0.7)
+    times = 0.05 * (np.arange(40.0)[:, None] + np.linspace(0.0, 1.0, 11))
+    found = gusts.values(times, np.random.default_rng(4))
+    white = np.random.default_rng(4).standard_normal((401, 6)) * gusts.size()
+    keep = np.exp(-0.005 / 0.7)
+    expected = [white[0]]
+    for fresh in white[1:]:
+        expected.append(keep * expected[-1] + np.sqrt(1.0 - keep**2) * fresh)
+    np.testing.assert_allclose(found[:, :-1].reshape(-1, 6), expected[:-1], rtol=1e-9, atol=1e-12)
+    assert np.array_equal(found[1:, 0], found[:-1, -1])
+
+
+def test_a_random_reference_is_the_sum_of_its_sines():
+    reference, times = RandomSmooth(harmonics=4), np.linspace(0.0, 12.0, 241)
+    rows = reference.rows(times, np.random.default_rng(5))
+    draws = np.random.default_rng(5).random((3, 3, 4))
+    amplitude = draws[0] / draws[0].sum(axis=1, keepdims=True) * np.array(reference.amplitude)[:, None]
+    rate = reference.rate_min + (reference.rate_max - reference.rate_min) * draws[1]
+    phase = 2.0 * np.pi * draws[2]
+    angle = times[:, None, None] * rate + phase
+    np.testing.assert_allclose(
+        rows[:, :3], (amplitude * (np.sin(angle) - np.sin(phase))).sum(axis=2), atol=1e-14
+    )
+    np.testing.assert_allclose(rows[:, 3:6], (amplitude * rate * np.cos(angle)).sum(axis=2), atol=1e-14)
+
+
+def test_a_table_of_references_is_that_of_the_readable_twin():
+    times = np.linspace(0.0, 10.0, 201)
+    for reference in (Heading(Racetrack(), tangent=True), Heading(Racetrack(), rate=3.0), RandomSmooth()):
+        rows = reference.rows(times, np.random.default_rng(0))
+        table = np.empty((201, N_TABLE))
+        assert tabulate(rows, 0.05, 100.0, table)
+        np.testing.assert_allclose(table, with_turn_rates(rows, 0.05), rtol=1e-12, atol=1e-12)
+        rows[7, 3] = np.inf
+        assert not tabulate(rows, 0.05, 100.0, table)

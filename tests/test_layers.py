@@ -9,8 +9,7 @@ ROOT = pathlib.Path(__file__).parent.parent
 LAYERS = ["quad_envs", "controllers", "baselines", "benchmarks"]
 # Rooms of a package from the ground up: a room imports from those before it.
 FLOORS = {
-    "controllers": "packed qp fallback disturbance controller model frame estimation mpc feedback team "
-    "stability",
+    "controllers": "qp fallback disturbance controller model frame estimation mpc feedback team stability",
     "baselines": "interruptions errors files policies evaluation training sweeps report "
     "reproduction certify cli __main__",
 }

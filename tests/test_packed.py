@@ -7,9 +7,9 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import pytest
 
-from controllers.packed import pack, unpacker
 from controllers.qp.ocp import IntArray
 from quad_envs._numba import kernel
+from quad_envs.packed import pack, unpacker
 from quad_envs.parameters import Array
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 from quad_envs._numba import entry_of, kernel, threaded_kernel
+from quad_envs.packed import unpacker
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 from quad_envs.rotations import sincos, wrap_angle_scalar
 from quad_envs.tasks import Task
@@ -17,7 +18,6 @@ from quad_envs.tasks import Task
 from ..controller import first_non_finite
 from ..fallback import RELAXED
 from ..model import RK4_SCRATCH, rk4_sensitivities
-from ..packed import unpacker
 from ..qp.linalg import copy, fill
 from ..qp.ocp import IntArray
 from ..qp.workspace import Workspace

@@ -7,12 +7,12 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from quad_envs._numba import entry_of, threaded_kernel
+from quad_envs.packed import unpacker
 from quad_envs.parameters import ATTITUDE, Array
 from quad_envs.tasks import Task
 
 from ..controller import first_non_finite
 from ..model import hover_pair
-from ..packed import unpacker
 from ..qp.ocp import IntArray
 from ..qp.workspace import Workspace
 from .kernels import (

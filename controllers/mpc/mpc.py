@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quad_envs.limits import Limits
+from quad_envs.packed import pack
 from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, RATES, Array
 from quad_envs.tasks import BaseTask, Task
 
@@ -26,7 +27,6 @@ from ..disturbance import ESTIMATOR_SIZE, N_DISTURBANCE
 from ..fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXED_WEIGHT
 from ..frame import rotor_lag
 from ..model import hover_pair
-from ..packed import pack
 from ..qp import Backend, Status, StructuredSolver
 from ..qp.ocp import IntArray, OcpQp, StateRows, concatenate_rows, no_rows, output_rows
 from ..qp.riccati import dare

@@ -21,13 +21,13 @@ from numpy.typing import ArrayLike
 from quad_envs._numba import entry_of, kernel
 from quad_envs.limits import LIMITS
 from quad_envs.names import shown
+from quad_envs.packed import unpacker
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 from quad_envs.tasks import Task
 
 from ..controller import Decision, all_finite, as_rows, first_non_finite, raise_non_finite
 from ..fallback import RELAXED, limit_command
 from ..model import RK4_SCRATCH, rk4_sensitivities
-from ..packed import unpacker
 from ..qp.linalg import invert_spd, matmul, matvec, transpose
 from ..qp.ocp import IntArray
 from ..qp.recursion import Feedback, Regulator, optimal_plan, riccati_pass

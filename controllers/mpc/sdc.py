@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Annotated, Any, NamedTuple
 
 from quad_envs._numba import entry_of, kernel, threaded_kernel
+from quad_envs.packed import unpacker
 from quad_envs.parameters import N_STATE, Array
 from quad_envs.tasks import Task
 
 from ..controller import first_non_finite
 from ..fallback import RELAXED
 from ..model import sdc_matrix, zero_order_hold
-from ..packed import unpacker
 from ..qp.linalg import copy
 from ..qp.ocp import IntArray
 from ..qp.riccati import solve_dare

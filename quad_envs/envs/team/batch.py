@@ -27,6 +27,7 @@ from ...lanes import (
 )
 from ...names import nearest_name, shown, unknown_name
 from ...observations.tracking import N_REFERENCE
+from ...packed import IntArray, pack
 from ...parameters import ROTOR_RATE
 from ...plant import N_STATE, Array
 from ...references import make_reference, pack_rows
@@ -34,14 +35,13 @@ from ...sensors import sensor_rows
 from ...table_row import N_TABLE
 from ...targets import N_TARGET, make_target
 from ..shared.given import given_plants
-from ..shared.plan import IntArray, make_plan
 from ..shared.tables import checked_rows, disturbance_rows, draw_vehicle, reference_rows, stage_times
 from ..shared.task_vector import task_vector
 from .exchange import DISTURBANCE, DRAW, HEAD, NOISE, PLAN, REFERENCE, TARGET, Tables
 from .kernel import N_TOLD, Teams, begin_teams, scratch_size, step_teams
 from .options import EstimationOptions, FormationOptions, TargetTrackingOptions, TeamOptions
 from .scores import N_LOSS
-from .told import TeamScores, team_scores
+from .told import Parts, TeamScores, parts_of, team_scores
 
 _step, _begin = entry_of(step_teams), entry_of(begin_teams)
 Generators = Sequence[np.random.Generator]
@@ -79,7 +79,7 @@ class TeamBatch:
             Tables(
                 self._weights(),
                 self.neighbours,
-                np.ascontiguousarray(self.graphs.which, dtype=np.int64),
+                np.array(self.graphs.which, dtype=np.int64),
                 self._offsets(),
                 self._which,
                 self.references,
@@ -92,7 +92,7 @@ class TeamBatch:
             _team_vector(options),
             np.zeros(scratch_size(self.n, layout.sensed)),
         )
-        self._plan = self._make_plan()
+        self._words = pack(self._arrays)
         self._constraints = len(self.task.constraint_names)
         self._told_shape = N_TOLD + 2 * self._constraints + N_LOSS, teams * self.n
         self._place(*draw_vehicle(self.task, {}, np.random.default_rng(0)))
@@ -101,20 +101,20 @@ class TeamBatch:
                 for i in options.informed():
                     self.vehicles.write(MEASURES, np.ones(1), t * self.n + i)
 
-    def _make_plan(self) -> IntArray:
-        before, (tables, *after) = self._arrays[:3], self._arrays[3:]
-        return make_plan((*before, *tables, *after))
-
     def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key != "_plan"}
+        return {key: value for key, value in self.__dict__.items() if key != "_words"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._plan = self._make_plan()
+        self._words = pack(self._arrays)
 
     def fresh_scores(self) -> Array:
         """Where `begin` and `step` write their scores, see `kernel.N_TOLD`."""
         return np.empty(self._told_shape)
+
+    def parts(self, told: Array) -> Parts:
+        """What is told there, kind by kind."""
+        return parts_of(told, self._constraints)
 
     def scores(self, told: Array) -> TeamScores:
         """What is told there."""
@@ -234,7 +234,7 @@ class TeamBatch:
             start[:] = self._start(rng) if given is None else given
             self.options.require_apart(start[:, :3])
             self._draw(t, rng)
-        _begin(self._plan, index, plants, out, told, self._constraints)
+        _begin(self._words, index, plants, out, told, self._constraints)
 
     def _draw(self, t: int, rng: np.random.Generator) -> None:
         """What else is drawn for team t."""
@@ -294,7 +294,7 @@ class TeamBatch:
         Raises:
             ValueError: If an action is not finite; then nobody has moved.
         """
-        bad = _step(self._plan, actions, out, told, self._constraints)
+        bad = _step(self._words, actions, out, told, self._constraints)
         if bad >= 0:
             row, entry = divmod(bad, self.task.action_size)
             raise ValueError(

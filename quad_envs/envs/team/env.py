@@ -19,7 +19,7 @@ from ...tasks import TeamTask
 from ..shared.render_modes import NO_RENDERING, checked_rendering
 from .batch import TeamBatch
 from .options import TeamOptions
-from .told import TeamScores
+from .told import Parts
 
 if TYPE_CHECKING:
     from ..pictures import TeamPictures
@@ -152,7 +152,7 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
             self._pictures.record()
         self.agents = self.possible_agents.copy()
         self._rows = np.arange(len(self.agents))
-        infos = self._infos(self.agents, self._batch.scores(told))
+        *_, infos = self._tell(self.agents, self._batch.parts(told))
         return dict(zip(self.agents, observations, strict=True)), infos
 
     def step(
@@ -170,22 +170,16 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
         self._batch.step(stacked.reshape(-1), observations.reshape(-1), told)
         if self._pictures:
             self._pictures.record(stacked)
-        scores, which = self._batch.scores(told), self._rows
+        parts, which = self._batch.parts(told), self._rows
         if len(which) < len(self.possible_agents):
-            some: Any = (part[which] for part in scores)
-            scores, observations = TeamScores(*some), observations[which]
-        terminated, truncated = scores.terminated.tolist(), scores.truncated.tolist()
-        answer = (
-            dict(zip(agents, observations, strict=True)),
-            dict(zip(agents, scores.reward.tolist(), strict=True)),
-            dict(zip(agents, terminated, strict=True)),
-            dict(zip(agents, truncated, strict=True)),
-            self._infos(agents, scores),
-        )
-        if True in terminated or True in truncated:
-            self._rows = which[~(scores.terminated | scores.truncated)]
+            observations = observations[which]
+            numbers, counts, flags, values, terms = parts
+            parts = Parts(numbers[:, which], counts[:, which], flags[:, which], values[which], terms[which])
+        rewards, terminated, truncated, infos = self._tell(agents, parts)
+        if True in terminated.values() or True in truncated.values():
+            self._rows = which[[not (terminated[name] or truncated[name]) for name in agents]]
             self.agents = [self.possible_agents[i] for i in self._rows]
-        return answer
+        return dict(zip(agents, observations, strict=True)), rewards, terminated, truncated, infos
 
     def render(self) -> NDArray[np.uint8] | None:
         """The picture of the present moment, (height, width, 3); with "human" it is in the window already."""
@@ -246,29 +240,21 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
                 raise ValueError(f"action of {name} must be {self._action_size} numbers, got {shown(action)}")
 
     @staticmethod
-    def _infos(agents: list[str], scores: TeamScores) -> dict[str, Named]:
-        """Info of each agent; arrays are rows of one array of the team."""
-        columns = (
-            scores.cost,
-            scores.episode_cost,
-            scores.violated,
-            scores.stage_cost,
-            scores.crashed,
-            scores.cause,
-            scores.clipped,
-            scores.slot_error,
-            scores.nearest,
-            scores.heard,
-        )
-        rows = zip(agents, *(column.tolist() for column in columns), strict=True)
-        return {
-            name: {
+    def _tell(
+        agents: list[str], parts: Parts
+    ) -> tuple[dict[str, float], dict[str, bool], dict[str, bool], dict[str, Named]]:
+        """Rewards, terminations, truncations and infos of the agents; arrays are rows of one of the team."""
+        rewards, *numbers = parts.numbers.tolist()
+        crashed, truncated, violated, terminated, _ = parts.flags.tolist()
+        columns = *numbers, *parts.counts.tolist(), crashed, violated
+        infos = [
+            {
                 "cost": cost,
                 "episode_cost": total,
-                "constraint_violation": violated,
+                "constraint_violation": violates,
                 "constraint_values": values,
                 "stage_cost": loss,
-                "crashed": crashed,
+                "crashed": crashes,
                 "crash_cause": cause,
                 "clipped_actions": clipped,
                 "formation_error": error,
@@ -277,8 +263,14 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
                 "reward_terms": terms,
             }
             for (
-                (name, cost, total, violated, loss, crashed, cause, clipped, error, nearest, heard),
+                (loss, cost, total, error, nearest, clipped, cause, heard, crashes, violates),
                 values,
                 terms,
-            ) in zip(rows, scores.values, scores.terms, strict=True)
-        }
+            ) in zip(zip(*columns, strict=True), parts.values, parts.terms, strict=True)
+        ]
+        return (
+            dict(zip(agents, rewards, strict=True)),
+            dict(zip(agents, terminated, strict=True)),
+            dict(zip(agents, truncated, strict=True)),
+            dict(zip(agents, infos, strict=True)),
+        )

@@ -7,20 +7,20 @@ of every neighbour the last message that was heard. A neighbour has the same slo
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..._numba import Int, inline_kernel, kernel
-from ...lanes import ALIVE, HEARD, LANES, MOST_VALUES, SINES, STEP, six
+from ...lanes import ALIVE, HEARD, LANES, MOST_VALUES, STEP
 from ...observations.team import N_COMM, N_MEASURED, N_PLAN_STAGE, N_SENSED
 from ...observations.tracking import encode_preview, measured
+from ...packed import IntArray
 from ...plant import Array
 from ...rotations import sincos
 from ...sensors import AZIMUTH, RANGE, measure, reads
-from ...table_row import N_REFERENCE
-from ..shared.plan import IntArray
+from ...table_row import N_REFERENCE, N_TABLE
 from ..shared.task_vector import DT, PREVIEW
 from ..tracking.kernel import encode_vehicle
 
@@ -58,18 +58,17 @@ TEAM_SIZE = SCALES + MOST_VALUES
 class Tables(NamedTuple):
     """What a team's step reads: who hears whom, and what was tabulated at reset."""
 
-    weights: Array  # (M, N, K), G_ij per graph and slot
-    neighbours: IntArray  # (N, K), sender of each slot, -1 for none
-    schedule: IntArray  # (T+1,), graph of each step
-    offsets: Array  # (N, K + 1, 3), delta_ij per slot, then p_i* relative to the leader or the target, m
-    which: IntArray  # (5, n), table that a vehicle reads: reference, disturbance, noise, target, draw
-    references: Array  # (n_tables, n_steps, N_TABLE), of the leader
-    disturbances: Array  # (n_tables, n_steps, n_nodes, 6)
-    noises: Array  # (n_tables, n_steps, 12), of the vehicles' own state; no steps for none
-    targets: Array  # (n_tables, n_steps, 6), r and v of the target; no steps for none
-    draws: (
-        Array  # (n_tables, n_steps, N, 4 + K): measurement noise 3, detection, drop-outs; no steps for none
-    )
+    weights: Annotated[Array, "M, N, K"]  # G_ij per graph and slot
+    neighbours: Annotated[IntArray, "N, K"]  # sender of each slot, -1 for none
+    schedule: Annotated[IntArray, "T"]  # graph of each step
+    offsets: Annotated[Array, "N, L, 3"]  # m, delta_ij per slot, then p_i* beside the leader or the target
+    which: Annotated[IntArray, "5, n"]  # table of a vehicle: reference, disturbance, noise, target, draw
+    references: Annotated[Array, f"M, T, {N_TABLE}"]  # tables, of the leader
+    disturbances: Annotated[Array, "M, T, L, 6"]  # tables
+    noises: Annotated[Array, "M, T, 12"]  # tables, of the vehicles' own state; no steps for none
+    targets: Annotated[Array, "M, T, 6"]  # tables, r and v of the target; no steps for none
+    # Tables: measurement noise 3, detection, drop-outs; no steps for none.
+    draws: Annotated[Array, "M, T, N, L"]
 
 
 # Rows of `which`.
@@ -93,10 +92,7 @@ def motion(x: tuple[float, ...], sines: tuple[float, ...], out: Array) -> None:
 def told_motion(w: Array, j: Int, noise: Array, out: Array) -> None:
     """Motion of the vehicle in lane j as its own sensors tell it, into out (>= 10,)."""
     x, _ = measured(w, j, noise)
-    sines = six(w, SINES + j)
-    if noise.shape[0] > 0:
-        sines = sincos(x[6]) + sincos(x[7]) + sincos(x[8])
-    motion(x, sines, out)
+    motion(x, sincos(x[6]) + sincos(x[7]) + sincos(x[8]), out)
 
 
 @inline_kernel
@@ -170,7 +166,9 @@ def hear(
 
 
 @kernel
-def sense(i: int, motions: Array, places: Array, team: Array, key: Array, which: Array) -> int:
+def sense(
+    i: int, motions: Array, places: Array, squares: Array, team: Array, key: Array, which: Array
+) -> int:
     """The most urgent vehicles within the sensing radius of vehicle i, most urgent first.
 
     Approaching ones by the time to contact max(|d| - d_s, 0) / closing speed, then the others by distance.
@@ -179,6 +177,7 @@ def sense(i: int, motions: Array, places: Array, team: Array, key: Array, which:
         i: Vehicle of the team.
         motions: True motions of the team, (N, 10).
         places: Positions, (3, N); those that crashed are far from everybody.
+        squares: Scratch, (N,).
         team: Team vector.
         key: Scratch, (K_s,).
         which: Result, (K_s,).
@@ -188,13 +187,14 @@ def sense(i: int, motions: Array, places: Array, team: Array, key: Array, which:
     """
     most, found = which.shape[0], 0
     reach = team[SENSING_RADIUS] * team[SENSING_RADIUS]
-    own = motions[i]
-    for j in range(motions.shape[0]):
-        dx, dy, dz = places[0, j] - own[0], places[1, j] - own[1], places[2, j] - own[2]
-        square = dx * dx + dy * dy + dz * dz
-        if square >= reach or j == i:
+    own, x, y, z = motions[i], places[0], places[1], places[2]
+    for j in range(squares.size):
+        squares[j] = (x[j] - own[0]) ** 2 + (y[j] - own[1]) ** 2 + (z[j] - own[2]) ** 2
+    for j in range(squares.size):
+        if squares[j] >= reach or j == i:
             continue
-        distance = math.sqrt(square)
+        dx, dy, dz = x[j] - own[0], y[j] - own[1], z[j] - own[2]
+        distance = math.sqrt(squares[j])
         parting = (
             dx * (motions[j, 3] - own[3]) + dy * (motions[j, 4] - own[4]) + dz * (motions[j, 5] - own[5])
         )

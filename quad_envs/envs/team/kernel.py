@@ -7,7 +7,7 @@ environment is a batch of one team, so that it and the batched form are the same
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +43,8 @@ from ...lanes import (
     twelve,
 )
 from ...observations.team import N_PLAN_STAGE
+from ...packed import IntArray, unpacker
 from ...plant import N_INPUT, Array
-from ..shared.plan import IntArray, floats_1, floats_2, floats_3, floats_4, integers_1, integers_2
 from ..shared.task_vector import DT, HOVER, SUBSTEPS
 from ..tracking.kernel import begin_lane, command, first_unsound, substep
 from .exchange import (
@@ -87,15 +87,15 @@ N_TOLD = FLAGS + 1
 
 
 class Teams(NamedTuple):
-    """What many teams consist of, in the order of their plan."""
+    """What many teams consist of, packed for the kernels."""
 
-    blocks: Array  # (teams * blocks of a team + 1, N_TEAM); the last one is for vehicles set aside
-    messages: Array  # what each vehicle heard, (n, K, HEAD + C)
-    history: Array  # contents of the last steps, (teams, depth, N, C)
+    blocks: Annotated[Array, "B, S"]  # those of one team after the other; the last one is to set aside
+    messages: Annotated[Array, "n, K, C"]  # what each vehicle heard, HEAD and content
+    history: Annotated[Array, "M, D, N, C"]  # contents of the last steps of each team
     tables: Tables
-    task: Array  # task vector
-    team: Array  # team vector
-    scratch: Array  # (scratch_size,)
+    task: Annotated[Array, "S"]  # task vector
+    team: Annotated[Array, "S"]  # team vector
+    scratch: Annotated[Array, "S"]  # (scratch_size,)
 
 
 class Told(NamedTuple):
@@ -110,31 +110,10 @@ class Told(NamedTuple):
 
 def scratch_size(vehicles: int, sensed: int) -> int:
     """Numbers that a team needs as scratch: places, motions, what is told, places again, who is near."""
-    return -(-vehicles // LANES) * _POINT + (2 * N_MOTION + 3) * vehicles + 2 * sensed + 6
+    return -(-vehicles // LANES) * _POINT + (2 * N_MOTION + 4) * vehicles + 2 * sensed + 6
 
 
-@inline_kernel
-def _teams(plan: IntArray) -> Teams:
-    return Teams(
-        floats_2(plan, np.int64(0)),
-        floats_3(plan, np.int64(1)),
-        floats_4(plan, np.int64(2)),
-        Tables(
-            floats_3(plan, np.int64(3)),
-            integers_2(plan, np.int64(4)),
-            integers_1(plan, np.int64(5)),
-            floats_3(plan, np.int64(6)),
-            integers_2(plan, np.int64(7)),
-            floats_3(plan, np.int64(8)),
-            floats_4(plan, np.int64(9)),
-            floats_3(plan, np.int64(10)),
-            floats_3(plan, np.int64(11)),
-            floats_4(plan, np.int64(12)),
-        ),
-        floats_1(plan, np.int64(13)),
-        floats_1(plan, np.int64(14)),
-        floats_1(plan, np.int64(15)),
-    )
+_teams = unpacker(Teams)
 
 
 @inline_kernel
@@ -231,16 +210,21 @@ def _inform(
         blocks: Of the team.
         t: Which it is.
         teams: All teams.
-        scratch: ((2 N_MOTION + 3) N + 2 K_s,).
+        scratch: ((2 N_MOTION + 4) N + 2 K_s,).
         out: Observations of all vehicles, (n, layout.size) float32.
     """
     tables, task, team, history = teams.tables, teams.task, teams.team, teams.history[t]
     n, sensed = tables.neighbours.shape[0], int(team[SENSED_SLOTS])
     first = t * n
     motions = scratch[: N_MOTION * n].reshape(n, N_MOTION)
-    told = scratch[N_MOTION * n : 2 * N_MOTION * n].reshape(n, N_MOTION)
+    told = motions
+    if tables.noises.shape[1] > 0:
+        told = scratch[N_MOTION * n : 2 * N_MOTION * n].reshape(n, N_MOTION)
     places = scratch[2 * N_MOTION * n : (2 * N_MOTION + 3) * n].reshape(3, n)
-    rest = scratch[(2 * N_MOTION + 3) * n :]
+    squares, rest = (
+        scratch[(2 * N_MOTION + 3) * n : (2 * N_MOTION + 4) * n],
+        scratch[(2 * N_MOTION + 4) * n :],
+    )
     key, near = rest[:sensed], rest[sensed : 2 * sensed]
     k = int(blocks[0, STEP])
     now = history[k % history.shape[0]]
@@ -249,7 +233,8 @@ def _inform(
     for i in range(n):
         w, j = blocks[i // LANES], i % LANES
         motion(twelve(w, PLANT + j), six(w, SINES + j), motions[i])
-        told_motion(w, j, tables.noises[tables.which[NOISE, first + i]], told[i])
+        if tables.noises.shape[1] > 0:
+            told_motion(w, j, tables.noises[tables.which[NOISE, first + i]], told[i])
         for c in range(N_MOTION):
             now[i, c] = told[i, c]
         for c in range(3):
@@ -262,7 +247,7 @@ def _inform(
         messages = teams.messages[first + i]
         if w[LEFT + j] == 0.0:  # who crashes in this step still sees where
             hear(k, i, blocks, first, history, tables, team, messages)
-            count = sense(i, motions, places, team, key, near)
+            count = sense(i, motions, places, squares, team, key, near)
             observe_agent(
                 i, w, told[i], now[i, MEASUREMENT:], messages, motions, tables.offsets[i], reference,
                 tables.disturbances[tables.which[DISTURBANCE, first + i]],
@@ -349,7 +334,7 @@ def _command_team(
 
 @lane_kernel
 def step_teams(
-    plan: IntArray,
+    words: IntArray,
     flat_actions: NDArray[np.float32],
     flat_out: NDArray[np.float32],
     told_block: Array,
@@ -358,7 +343,7 @@ def step_teams(
     """One control period of every team.
 
     Args:
-        plan: Of the `Teams`.
+        words: The `Teams`, packed.
         flat_actions: (n action_size,).
         flat_out: Observations, (n layout.size,).
         told_block: Scores of all, see N_TOLD.
@@ -370,7 +355,7 @@ def step_teams(
     bad = first_unsound(flat_actions)
     if bad >= 0:
         return bad
-    teams, told, all_ = _teams(plan), _told(borrowed(told_block), constraints), told_block.shape[1]
+    teams, told, all_ = _teams(words), _told(borrowed(told_block), constraints), told_block.shape[1]
     actions = borrowed(flat_actions).reshape(all_, flat_actions.size // all_)
     out = borrowed(flat_out).reshape(all_, flat_out.size // all_)
     tables, task, team = teams.tables, teams.task, teams.team
@@ -394,7 +379,7 @@ def step_teams(
 
 @kernel
 def begin_teams(
-    plan: IntArray,
+    words: IntArray,
     index: IntArray,
     plants: Array,
     flat_out: NDArray[np.float32],
@@ -404,14 +389,14 @@ def begin_teams(
     """Begin episodes; until a vehicle has sent a plan, its neighbours are told that it goes straight on.
 
     Args:
-        plan: Of the `Teams`.
+        words: The `Teams`, packed.
         index: Teams, (m,).
         plants: Where their vehicles start, (m, N, 16).
         flat_out: As in `step_teams`.
         told_block: As in `step_teams`.
         constraints: As in `step_teams`.
     """
-    teams, told, all_ = _teams(plan), _told(borrowed(told_block), constraints), told_block.shape[1]
+    teams, told, all_ = _teams(words), _told(borrowed(told_block), constraints), told_block.shape[1]
     out = borrowed(flat_out).reshape(all_, flat_out.size // all_)
     tables, task, team = teams.tables, teams.task, teams.team
     n = tables.neighbours.shape[0]

@@ -37,12 +37,34 @@ class TeamScores(NamedTuple):
     terms: Array  # (n, number of terms of the reward)
 
 
-def team_scores(told: Array, constraints: int) -> TeamScores:
-    """The scores in what the kernel told, see `kernel.N_TOLD`."""
+class Parts(NamedTuple):
+    """What the kernel told, kind by kind."""
+
+    numbers: Array  # (6, n): from reward to distance of the nearest, as in `TeamScores`
+    counts: Counts  # (3, n)
+    flags: Bools  # (5, n)
+    values: Array  # (n, number of constraints)
+    terms: Array  # (n, number of terms of the reward)
+
+
+def parts_of(told: Array, constraints: int) -> Parts:
+    """Views of what the kernel told, see `kernel.N_TOLD`."""
     n, end = told.shape[1], N_TOLD + constraints
-    reward, stage_cost, cost, episode_cost, slot_error, nearest = told[:COUNTS]
-    clipped, cause, heard = told[COUNTS:FLAGS].view(_COUNT)
-    crashed, truncated, violated, terminated, alive = told[FLAGS].view(_FLAG).reshape(8, n)[:_N_FLAGS]
+    return Parts(
+        told[:COUNTS],
+        told[COUNTS:FLAGS].view(_COUNT),
+        told[FLAGS].view(_FLAG).reshape(8, n)[:_N_FLAGS],
+        told[N_TOLD:end].reshape(n, constraints),
+        told[end:].reshape(n, len(told) - end),
+    )
+
+
+def team_scores(told: Array, constraints: int) -> TeamScores:
+    """The scores in what the kernel told."""
+    parts = parts_of(told, constraints)
+    reward, stage_cost, cost, episode_cost, slot_error, nearest = parts.numbers
+    clipped, cause, heard = parts.counts
+    crashed, truncated, violated, terminated, alive = parts.flags
     return TeamScores(
         reward,
         stage_cost,
@@ -58,6 +80,6 @@ def team_scores(told: Array, constraints: int) -> TeamScores:
         violated,
         terminated,
         alive,
-        told[N_TOLD:end].reshape(n, constraints),
-        told[end:].reshape(n, len(told) - end),
+        parts.values,
+        parts.terms,
     )

@@ -13,12 +13,12 @@ from ...checks import array_bytes, require_memory
 from ...disturbances import Disturbance
 from ...lanes import COEFFICIENTS, DECAY, FORCE_MAX, LANES, N_PLANT, N_TRACKING, Blocks
 from ...names import shown
+from ...packed import IntArray, pack
 from ...parameters import ROTOR_RATE
 from ...plant import N_STATE, POSITION, Array
 from ...references import Reference, make_reference, state_on
 from ...table_row import N_TABLE
 from ..shared.given import given_plants
-from ..shared.plan import IntArray, make_plan
 from ..shared.tables import disturbance_rows, draw_vehicle, reference_rows, stage_times
 from ..shared.task_vector import task_vector
 from ..shared.workers import Workers
@@ -88,15 +88,17 @@ class TrackingBatch:
             task_vector(self.task, options.substeps, options.lost_distance),
         )
         self._told_shape = N_TOLD + len(self.task.constraint_names), n
-        self._plan = make_plan(self._arrays)
-        self._workers = Workers(min(threads, self.vehicles.count))
+        self._words = pack(self._arrays)
+        self._blocks = self.vehicles.count
+        threads = min(threads, self._blocks)
+        self._workers = Workers(threads) if threads > 1 else None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key != "_plan"}
+        return {key: value for key, value in self.__dict__.items() if key != "_words"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._plan = make_plan(self._arrays)
+        self._words = pack(self._arrays)
 
     def fresh_scores(self) -> Array:
         """Where `begin`, `step` and `tell` write their scores, see `kernel.N_TOLD`."""
@@ -142,7 +144,7 @@ class TrackingBatch:
                 plants[:, :N_STATE] += [state_on(self.reference(i)[0]) for i in index.tolist()]
         else:
             plants = np.ascontiguousarray(states)
-        lost = _begin(self._plan, index, plants, out, told)
+        lost = _begin(self._words, index, plants, out, told)
         if lost >= 0:
             off = plants[lost, POSITION] - self.reference(int(index[lost]))[0, POSITION]
             raise ValueError(
@@ -171,7 +173,7 @@ class TrackingBatch:
 
     def tell(self, index: IntArray, out: NDArray[np.float32], told: Array) -> None:
         """Write observations and scores of flights as they are; arguments as in `begin`."""
-        _tell(self._plan, index, out, told)
+        _tell(self._words, index, out, told)
 
     def reference(self, i: int) -> Array:
         """Reference rows of flight i in its present episode, a view, (n_steps, N_TABLE)."""
@@ -191,10 +193,10 @@ class TrackingBatch:
         Raises:
             ValueError: If an action is not finite; then no flight has moved.
         """
-        if self._workers.threads == 1:
-            ended = _step(self._plan, actions, out, told, 0, self.vehicles.count)
+        if self._workers is None:
+            ended = _step(self._words, actions, out, told, 0, self._blocks)
         else:
-            ended = self._workers.run(_step, self.vehicles.count, self._plan, actions, out, told)
+            ended = self._workers.run(_step, self._blocks, self._words, actions, out, told)
         if ended < 0:
             bad = -1 - ended
             where = f"[{bad}]" if self.n == 1 else f"[{bad // 4}, {bad % 4}]"

@@ -112,9 +112,22 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
 
             self._pictures = TrackingPictures(self._batch, 0, size)
         self._size = self.task.layout.size
-        self._told = self._batch.fresh_scores()
+        self._bind()
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.observation_space = spaces.Box(-np.inf, np.inf, (self._size,), np.float32)
+
+    def _bind(self) -> None:
+        """Where the kernel tells its scores, and views of it, which take longer to make than to read."""
+        self._told = self._batch.fresh_scores()
+        self._values, self._memory = self._told[N_TOLD:, 0], self._told.data
+
+    def __getstate__(self) -> dict[str, Any]:
+        views = ("_told", "_values", "_memory")
+        return {key: value for key, value in self.__dict__.items() if key not in views}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._bind()
 
     @property
     def options(self) -> TrackingOptions:
@@ -171,12 +184,12 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def _answer(self) -> tuple[float, bool, bool, dict[str, Any]]:
         """Reward, terminated, truncated and info of what the kernel told."""
-        reward, loss, cost, total, clipped, cause, crashed, truncated, violated = _unpack(self._told.data)
+        reward, loss, cost, total, clipped, cause, crashed, truncated, violated = _unpack(self._memory)
         info = {
             "cost": cost,
             "episode_cost": total,
             "constraint_violation": violated,
-            "constraint_values": self._told[N_TOLD:, 0].copy(),
+            "constraint_values": self._values.copy(),
             "stage_cost": loss,
             "crashed": crashed,
             "crash_cause": cause,

@@ -6,7 +6,7 @@ single and vector environments are the same computation by construction.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,11 +47,11 @@ from ...lanes import (
     twelve,
 )
 from ...observations.tracking import N_OWN, encode_disturbance, encode_own, encode_preview, measured
+from ...packed import IntArray, unpacker
 from ...plant import N_INPUT, N_STATE, Array
 from ...reward import stage_cost_parts
 from ...table_row import N_TABLE
 from ...tasks import CRASH_CAUSES
-from ..shared.plan import IntArray, floats_1, floats_2, floats_3, floats_4, integers_2
 from ..shared.task_vector import (
     ACTION_MAX,
     DT,
@@ -85,14 +85,14 @@ stage_cost_in_lanes = fused(stage_cost_parts)
 
 
 class Flights(NamedTuple):
-    """What n tracking flights consist of, in the order of their plan."""
+    """What n tracking flights consist of, packed for the kernels."""
 
-    blocks: Array  # (n / LANES + 1, N_TRACKING); the last one is for those that begin
-    references: Array  # tables (n_tables, n_steps, N_TABLE)
-    disturbances: Array  # tables (n_tables, n_steps, 2 substeps + 1, 6); no steps for none
-    noises: Array  # tables (n_tables, n_steps, 12); no steps for none
-    which: IntArray  # reference, disturbance and noise table of each vehicle, (3, n)
-    task: Array  # task vector
+    blocks: Annotated[Array, "B, S"]  # n / LANES + 1; the last one is for those that begin
+    references: Annotated[Array, f"M, T, {N_TABLE}"]  # tables
+    disturbances: Annotated[Array, "M, T, L, 6"]  # tables, L = 2 substeps + 1; no steps for none
+    noises: Annotated[Array, "M, T, 12"]  # tables; no steps for none
+    which: Annotated[IntArray, "3, n"]  # reference, disturbance and noise table of each vehicle
+    task: Annotated[Array, "S"]  # task vector
 
 
 class Told(NamedTuple):
@@ -115,16 +115,7 @@ def _told(block: Array) -> Told:
     )
 
 
-@inline_kernel
-def _flights(plan: IntArray) -> Flights:
-    return Flights(
-        floats_2(plan, np.int64(0)),
-        floats_3(plan, np.int64(1)),
-        floats_4(plan, np.int64(2)),
-        floats_3(plan, np.int64(3)),
-        integers_2(plan, np.int64(4)),
-        floats_1(plan, np.int64(5)),
-    )
+_flights = unpacker(Flights)
 
 
 @inline_lane_kernel
@@ -366,7 +357,7 @@ def first_unsound(actions: NDArray[np.float32]) -> int:
 
 @lane_kernel
 def step_flights(
-    plan: IntArray,
+    words: IntArray,
     flat_actions: NDArray[np.float32],
     flat_out: NDArray[np.float32],
     told_block: Array,
@@ -376,7 +367,7 @@ def step_flights(
     """One control period of the vehicles in blocks begin..end-1.
 
     Args:
-        plan: Of the `Flights`.
+        words: The `Flights`, packed.
         flat_actions: Of all vehicles, (4 n,).
         flat_out: Observations of all, (n layout.size,).
         told_block: Scores of all, see N_TOLD.
@@ -389,7 +380,7 @@ def step_flights(
     bad = first_unsound(flat_actions)
     if bad >= 0:
         return -1 - bad
-    flights, told, n = _flights(plan), _told(borrowed(told_block)), told_block.shape[1]
+    flights, told, n = _flights(words), _told(borrowed(told_block)), told_block.shape[1]
     actions, out = (
         borrowed(flat_actions).reshape(n, N_INPUT),
         borrowed(flat_out).reshape(n, flat_out.size // n),
@@ -434,12 +425,12 @@ def _is_lost(plant: Array, reference: Array, task: Array) -> bool:
 
 @kernel
 def begin_flights(
-    plan: IntArray, index: IntArray, plants: Array, flat_out: NDArray[np.float32], told_block: Array
+    words: IntArray, index: IntArray, plants: Array, flat_out: NDArray[np.float32], told_block: Array
 ) -> int:
     """Begin episodes, and tell what their vehicles see.
 
     Args:
-        plan: Of the `Flights`.
+        words: The `Flights`, packed.
         index: Vehicles, (m,).
         plants: Where they start, (m, 16).
         flat_out: As in `step_flights`.
@@ -448,7 +439,7 @@ def begin_flights(
     Returns:
         -1, or the place in `index` of the first vehicle that starts lost: then nothing was changed.
     """
-    flights, told, n = _flights(plan), _told(borrowed(told_block)), told_block.shape[1]
+    flights, told, n = _flights(words), _told(borrowed(told_block)), told_block.shape[1]
     out, task = borrowed(flat_out).reshape(n, flat_out.size // n), flights.task
     blocks, w = flights.blocks, flights.blocks[flights.blocks.shape[0] - 1]
     for m in range(index.size):
@@ -471,9 +462,9 @@ def begin_flights(
 
 
 @kernel
-def tell_flights(plan: IntArray, index: IntArray, flat_out: NDArray[np.float32], told_block: Array) -> None:
+def tell_flights(words: IntArray, index: IntArray, flat_out: NDArray[np.float32], told_block: Array) -> None:
     """Tell of the vehicles `index` as they are; arguments as in `step_flights`."""
-    flights, told, n = _flights(plan), _told(borrowed(told_block)), told_block.shape[1]
+    flights, told, n = _flights(words), _told(borrowed(told_block)), told_block.shape[1]
     out = borrowed(flat_out).reshape(n, flat_out.size // n)
     for m in range(index.size):
         i = index[m]
