@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import quad_envs  # noqa: F401  registers the ids
-from baselines import PolicyError, check_policy, make_policy, safe
+from baselines import PolicyError, check_policy, evaluate, make_policy, safe
+from baselines.__main__ import main
 from baselines.policies.registry import policy_options
 from baselines.sweeps.suite_files import suite_from_dict
 from controllers import SafetyFilter, SafetyOptions
@@ -148,6 +149,20 @@ def test_options_are_those_of_the_filter():
     with pytest.raises(ValueError, match="at least 2"):
         SafetyOptions(horizon=1)
     assert policy_options("safe:nmpc")["weight"] == SafetyOptions().weight
+
+
+def test_the_command_line_lists_the_options_of_the_filter_with_what_they_mean(capsys):
+    assert main(["list", "safe:ppo-corridor"]) == 0
+    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("  weight"))
+    assert "50.0" in line and "of a change of the wanted command" in line
+
+
+def test_an_evaluation_says_how_often_the_filter_intervened_and_only_where_there_is_one():
+    filtered, bare = (evaluate(name, CORRIDOR, episodes=1, seed=10_000) for name in ("safe:hover", "hover"))
+    (record,) = filtered.records
+    assert 0.0 < record.intervention_share <= 1.0 and record.intervention_size > 0.0
+    assert record.unanswered_share == 0.0
+    assert "intervention_share" in str(filtered) and "intervention" not in str(bare)
 
 
 def test_an_unknown_policy_behind_the_filter_is_named():

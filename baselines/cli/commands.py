@@ -77,6 +77,7 @@ def list_names(options: ListOptions) -> int:
             text = entry if isinstance(entry, str) else ", ".join(f"{k}={v!r}" for k, v in entry.items())
             print(f"  {name:28} {text}")
     print("\nquad-envs list NAME shows the options of an environment, a policy or a training algorithm")
+    print("safe:NAME puts a safety filter in front of any policy for one vehicle")
     return 0
 
 
@@ -136,6 +137,7 @@ def _list_options(options: ListOptions) -> int:
     from ..policies.registry import (
         TEAM_POLICIES,
         TRACKING_POLICIES,
+        behind_filter,
         from_outside,
         policy_comments,
         policy_options,
@@ -157,7 +159,7 @@ def _list_options(options: ListOptions) -> int:
     elif options.name in ALGORITHMS:
         values, flag = plain_options(hyperparameters(options.name, "")), "train --hyper"
         comments = field_comments(options_of(options.name))
-    elif options.name in names or from_outside(options.name):
+    elif options.name in names or behind_filter(options.name) != options.name or from_outside(options.name):
         values, flag = policy_options(options.name), "--policy-set"
         comments = policy_comments(options.name)
     else:
