@@ -139,7 +139,9 @@ class Limits:
 
     def chosen(self) -> tuple[Limit, ...]:
         """The limits that are set, in the order of `LIMITS`."""
-        return tuple(limit for limit in LIMITS if np.isfinite(self._given(limit)).any())
+        return tuple(
+            limit for limit in LIMITS if np.isfinite(np.array(self._given(limit), dtype=float)).any()
+        )
 
     def output_box(self, dt: float) -> tuple[Array, Array]:
         """Lower and upper bound of every output y, (16,) each, +-inf where nothing bounds it.

@@ -56,7 +56,7 @@ def sensor_rows(sensor: str) -> int:
     Raises:
         ValueError: If there is no such sensor.
     """
-    if sensor not in SENSORS:
+    if not isinstance(sensor, str) or sensor not in SENSORS:
         raise ValueError(unknown_name("sensor", sensor, tuple(SENSORS)))
     read = SENSORS[sensor]
     return int(read.stop - read.start + _PER_FIRST * read.start)

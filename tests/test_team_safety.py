@@ -10,6 +10,7 @@ from baselines.reproduction.meetings import meet
 from controllers.team.collision import AvoidanceOptions, time_to_stop
 from controllers.team.cooperative import CooperativeMpc
 from controllers.team.cooperative_kernels import turning_velocity
+from controllers.team.situation import TeamSituation
 from quad_envs import formation_v0, target_tracking_v0
 from quad_envs.rotations import rotation_body_from_inertial
 
@@ -59,10 +60,8 @@ def plan_of_a_roll(turning, V_z=-1.8):
     preview[..., 1], preview[..., 5], preview[..., 7] = 1.0, V_z, 1.0
     comm = np.zeros((1, layout.neighbours, layout.comm_size))
     memory, sensed = np.zeros((1, controller.memory_size)), np.zeros((1, layout.sensed, 7))
-    qp = controller.problems(
-        plant, np.full((1, 4), hover), [1.0], preview, comm, sensed, None, None, None, None,
-        np.zeros((1, 6)), memory,
-    )[0]  # fmt: skip
+    situation = TeamSituation(plant, np.full((1, 4), hover), comm, sensed, np.ones(1, bool), preview)
+    qp = controller.problems(situation, memory)[0]
     roll = np.array([-1.0, -1.0, 1.0, 1.0]) * 0.3
     roll *= np.sign(qp.B[0][9] @ roll)  # a torque that rolls to the right
     x = np.zeros(12)
