@@ -31,3 +31,5 @@ from .sweeps.suite import Suite as Suite
 from .sweeps.suite_files import load_suite as load_suite
 from .training.runs import TrainingResult as TrainingResult
 from .training.runs import train as train
+from .training.tuning import TuningResult as TuningResult
+from .training.tuning import tune as tune

@@ -20,6 +20,7 @@ from .cli.options import (
     ReportOptions,
     ReproduceOptions,
     TrainOptions,
+    TuneOptions,
     WarmOptions,
     add_options,
     read_options,
@@ -62,6 +63,12 @@ def _train(options: TrainOptions) -> int:
     from .cli import train as train_command
 
     return train_command.train_one(options)
+
+
+def _tune(options: TuneOptions) -> int:
+    from .cli import tune as tune_command
+
+    return tune_command.tune_one(options)
 
 
 def _export(options: ExportOptions) -> int:
@@ -111,6 +118,7 @@ COMMANDS: dict[str, Command] = {
     "evaluate": Command(EvaluateOptions, _evaluate),
     "benchmark": Command(BenchmarkOptions, _benchmark),
     "train": Command(TrainOptions, _train),
+    "tune": Command(TuneOptions, _tune),
     "export": Command(ExportOptions, _export),
     "reproduce": Command(ReproduceOptions, _reproduce),
     "report": Command(ReportOptions, _report),

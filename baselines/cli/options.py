@@ -104,6 +104,31 @@ class TrainOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class TuneOptions:
+    """Tune the options of a controller, as its weights, for the score or the cost."""
+
+    env: Annotated[str, Positional("environment id, as quad/HelixTracking-v0")]
+    policy: Annotated[str, Positional("lmpc, sdc-nmpc, nmpc, score-nmpc or another with weights")]
+    objective: Annotated[str, "score or quadratic_cost"] = "score"
+    seed: Annotated[int, "of the search"] = 0
+    seconds: Annotated[float | None, "budget in CPU-seconds; 60 if not given"] = None
+    episodes: Annotated[int | None, "budget in episodes instead"] = None
+    tuned: Annotated[list[str], "option to tune; all that mean something if none is given"] = field(
+        default_factory=list
+    )
+    out: Annotated[Path | None, "folder; runs/tuned-POLICY-TASK-SEED if not given"] = None
+    set: Annotated[list[str], "keyword argument of the environment; JSON, {key: value}, or text"] = field(
+        default_factory=list
+    )
+    policy_set: Annotated[list[str], "option of the policy; JSON, {key: value}, or text"] = field(
+        default_factory=list
+    )
+    resume: Annotated[bool, "go on with the search in the folder"] = False
+    fresh: Annotated[bool, "discard the search that is in the folder"] = False
+    json: Annotated[bool, "print JSON"] = False
+
+
+@dataclass(frozen=True, slots=True)
 class ExportOptions:
     """Make a checkpoint of a model of Stable-Baselines3: layers alone, which run no code."""
 
@@ -212,7 +237,10 @@ def add_options(parser: argparse.ArgumentParser, kind: type[Any]) -> None:
         if positional:
             settings["nargs"] = "*" if many else None if required else "?"
         elif many:
-            settings |= {"action": "append", "metavar": "NAME" if entry.name == "policy" else "KEY=VALUE"}
+            settings |= {
+                "action": "append",
+                "metavar": "NAME" if entry.name in ("policy", "tuned") else "KEY=VALUE",
+            }
         elif hint is not bool:
             settings["metavar"] = {int: "N", float: "S", Path: "FOLDER"}.get(settings["type"], "NAME")
         if positional:

@@ -18,6 +18,7 @@ from quad_envs.names import shown, unknown_name
 from .outside import build, installed_policies, is_outside, names_factory, outside_options
 from .protocol import Policy
 from .trained import load_policy, names_trained, shipped_policies
+from .tuned import names_tuned, read_tuned
 
 if TYPE_CHECKING:  # not at run time: tasks load numba, and `quad-envs list` has to be quick
     from controllers.mpc.options import SafetyOptions
@@ -228,6 +229,12 @@ def _filter_options() -> type[SafetyOptions]:
     return SafetyOptions
 
 
+def options_type(name: str) -> type[Any] | None:
+    """The dataclass of a policy's options, as of `policy_options`; None: it takes keywords."""
+    outside = _is_filtered(name) or from_outside(name)
+    return None if outside else _options_type(_factory(policy_entry(name)))
+
+
 def _options_type(factory: Callable[..., Any]) -> type[Any] | None:
     """The dataclass of the options that a factory takes behind the task; None: it takes keywords."""
     kind: type[Any] | None = getattr(factory, "options_type", None)
@@ -268,11 +275,11 @@ def make_policy(name: str | os.PathLike[str] | Any, env: Any, **options: Any) ->
     """A policy for a task.
 
     Args:
-        name: One of TRACKING_POLICIES, or for a team one of TEAM_POLICIES; or a trained policy: the folder
-            of its training, or the name of a shipped one; or one of the user's: `module:factory`, the name of
-            an entry point, a factory, or a policy. A factory is called with the task, or with the environment
-            if its first parameter is called `env`. `safe:` before a name puts a safety filter in front, see
-            `safe`; options are then those of the filter.
+        name: One of TRACKING_POLICIES, or for a team one of TEAM_POLICIES; or a trained or tuned policy: the
+            folder of its training, or the name of a shipped one; or one of the user's: `module:factory`, the
+            name of an entry point, a factory, or a policy. A factory is called with the task, or with the
+            environment if its first parameter is called `env`. `safe:` before a name puts a safety filter in
+            front, see `safe`; options are then those of the filter.
         env: An environment (wrapped or not), a vector environment, an id, or a Task. Only its Task is used.
         options: Of the policy, see `policy_options`; MPCs take `horizon`, `solver` and what their chapter
             offers. A horizon that is not given is 25, or the preview of the task where that is shorter.
@@ -281,7 +288,7 @@ def make_policy(name: str | os.PathLike[str] | Any, env: Any, **options: Any) ->
     Raises:
         ValueError: If the name, an option or its value is not allowed, the policy is for other tasks, or the
             horizon exceeds the preview.
-        CheckpointError: If a trained policy cannot be read, or is for other tasks.
+        CheckpointError: If a trained or tuned policy cannot be read, or is for other tasks.
         PolicyError: If one of the user's cannot be made; the message names the line of the user's file.
     """
     from .environments import environment_of, task_of
@@ -291,6 +298,13 @@ def make_policy(name: str | os.PathLike[str] | Any, env: Any, **options: Any) ->
     if from_outside(name):
         made: Policy = build(name, lambda: task_of(env), lambda: environment_of(env), options)
         return made
+    if is_trained(name) and names_tuned(name):
+        if options:
+            raise ValueError(f"a tuned policy has the options that were found, got {', '.join(options)}")
+        tuned = read_tuned(name, task_of(env))
+        policy: Any = make_policy(tuned.policy, env, **tuned.options)
+        policy.name = os.path.basename(os.path.abspath(name))
+        return cast("Policy", policy)
     if is_trained(name):
         if options:
             raise ValueError(f"a trained policy has no options, got {', '.join(options)}")

@@ -21,6 +21,7 @@ from ..evaluation.columns import renamed
 from ..evaluation.evaluate import fly_and_measure
 from ..policies.network import Network, NetworkPolicy
 from ..policies.outside import import_named
+from ..policies.protocol import Policy
 
 HELD_OUT = 10_000  # the first environment seed that training must not use
 CHOOSING = 20_000  # the first of those that choose the best policy
@@ -117,15 +118,22 @@ class HeldOutFlights:
         self.task = self.env.unwrapped.task
 
     def judge(self, network: Network, cpu_seconds: float, progress: Progress, seed: int = CHOOSING) -> Point:
-        """Fly a network.
+        """Fly a network, see `judge_policy`."""
+        policy = NetworkPolicy(network, self.task, "training")
+        return self.judge_policy(policy, cpu_seconds, progress, seed)
+
+    def judge_policy(
+        self, policy: Policy, cpu_seconds: float, progress: Progress, seed: int = CHOOSING
+    ) -> Point:
+        """Fly a policy.
 
         Args:
-            network: It.
+            policy: It.
             cpu_seconds: That its training has taken.
             progress: Of its training.
             seed: Environment seed of the first flight.
         """
-        found = fly_and_measure(NetworkPolicy(network, self.task, "training"), self.env, self.flights, seed)
+        found = fly_and_measure(policy, self.env, self.flights, seed)
         summary = found.summary()
         return Point(
             cpu_seconds=cpu_seconds,

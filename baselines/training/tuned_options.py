@@ -1,0 +1,127 @@
+"""What of a policy's options can be tuned: numbers, searched on a scale on which a step means a factor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quad_envs.names import unknown_name
+from quad_envs.parameters import Array
+from quad_envs.tasks import Task, TeamTask
+
+from ..policies.registry import options_type, policy_options
+
+AnyTask = Task | TeamTask
+# Entries of the state that share a factor: x and y, as frame "heading" needs them, and their kin.
+_GROUPS = ((0, 1), (2,), (3, 4), (5,), (6, 7), (8,), (9, 10), (11,))
+_MOST = 3.0  # decades that a number may go from where it began
+
+
+class Knob(NamedTuple):
+    """An option that is tuned."""
+
+    size: int  # numbers of the search that it takes
+    value: Callable[[Array, AnyTask, Any], Any]  # of its numbers (size,), in decades; given the default
+    applies: Callable[[AnyTask, Mapping[str, Any]], bool] = lambda task, options: True
+
+
+def _state_weight(z: Array, task: AnyTask, default: Any) -> list[float]:
+    weight = np.array(task.weights.Q if default is None else default * np.ones(12), dtype=np.float64)
+    for factor, group in zip(10.0**z, _GROUPS, strict=True):
+        weight[list(group)] *= factor
+    return [float(entry) for entry in weight]
+
+
+def _input_weight(z: Array, task: AnyTask, default: Any) -> list[float]:
+    weight = np.array(task.weights.R if default is None else default * np.ones(4), dtype=np.float64)
+    return [float(entry) for entry in weight * 10.0 ** z[0]]
+
+
+def _positive(z: Array, task: AnyTask, default: Any) -> float:
+    return float(default * 10.0 ** z[0])
+
+
+def _share(z: Array, task: AnyTask, default: Any) -> float:
+    return min(1.0, float((0.5 if default == "auto" else default) * 10.0 ** z[0]))
+
+
+def _change_weight(z: Array, task: AnyTask, default: Any) -> float:
+    return float(10.0 ** (z[0] - 2.0) if default is None else default * 10.0 ** z[0])
+
+
+def _samples(z: Array, task: AnyTask, default: Any) -> int:
+    return int(np.clip(round(default * 10.0 ** z[0]), 1, max(1, task.layout.preview)))
+
+
+# Options by name, whichever policy has them; all but the horizon, which costs time, unless asked for.
+KNOBS: dict[str, Knob] = {
+    "Q": Knob(len(_GROUPS), _state_weight),
+    "R": Knob(1, _input_weight),
+    "R_rate": Knob(1, _change_weight),
+    "terminal": Knob(1, _positive),
+    "margin": Knob(1, _positive, lambda task, options: len(task.constraint_names) > 0),
+    "estimator_gain": Knob(1, _share, lambda task, options: options["reject_disturbance"]),
+    "floor": Knob(1, _share, lambda task, options: options["objective"] == "score"),
+    "horizon": Knob(1, _samples, lambda task, options: False),
+}
+
+
+class Search(NamedTuple):
+    """The options that are searched, and the policy's own with what the caller has set."""
+
+    names: tuple[str, ...]
+    task: AnyTask
+    defaults: dict[str, Any]
+    given: dict[str, Any]
+
+    @property
+    def size(self) -> int:
+        """Numbers that are searched."""
+        return sum(KNOBS[name].size for name in self.names)
+
+    @property
+    def bounds(self) -> Array:
+        """Of these numbers, (size, 2)."""
+        return np.tile([-_MOST, _MOST], (self.size, 1))
+
+    def options(self, z: Array) -> dict[str, Any]:
+        """The options of a point of the search, (size,); those of the policy at 0 but for R_rate, 0.01."""
+        out, at = dict(self.given), 0
+        for name in self.names:
+            knob = KNOBS[name]
+            out[name] = knob.value(z[at : at + knob.size], self.task, self.defaults[name])
+            at += knob.size
+        return out
+
+
+def make_search(policy: str, task: AnyTask, options: Mapping[str, Any], names: Sequence[str] = ()) -> Search:
+    """What is to be searched of a policy.
+
+    Args:
+        policy: A name of `make_policy`.
+        task: For which it is tuned.
+        options: Of the policy, which the search begins with.
+        names: Options to tune; none: all of KNOBS that the policy has and that mean something for the task.
+
+    Raises:
+        ValueError: If a name is none of KNOBS, or the policy has nothing to tune.
+    """
+    kind = options_type(policy)
+    own = {entry.name for entry in fields(kind)} if kind is not None else set()
+    known = [name for name in KNOBS if name in own]
+    if not known:
+        raise ValueError(
+            f"policy {policy!r} has no option that can be tuned ({', '.join(KNOBS)}); the MPCs "
+            "have some: lmpc, sdc-nmpc, nmpc, score-nmpc"
+        )
+    for name in names:
+        if name not in known:
+            raise ValueError(unknown_name(f"option of {policy!r} to tune:", name, known))
+    defaults = {**policy_options(policy), **options}
+    if "horizon" in defaults:
+        defaults["horizon"] = min(defaults["horizon"], task.layout.preview)
+    chosen = tuple(names) or tuple(name for name in known if KNOBS[name].applies(task, defaults))
+    return Search(chosen, task, defaults, dict(options))

@@ -1,0 +1,344 @@
+"""`tune`: the options of a controller, searched by CMA-ES on training starts for the score or the cost.
+
+A generation is some candidates on the same starts, all of a candidate's flights at once. The best of each
+generation is judged on held-out starts, and the best of those is what the folder holds.
+
+tuned.json    the best policy, which `make_policy` makes of the folder
+curve.csv     one row per judged candidate, as of a training
+last.json     from where --resume goes on
+config.json   task, policy, options, objective, seed, versions, revision, command
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+
+from quad_envs.checks import require_choice, require_whole
+from quad_envs.field_comments import called_with
+from quad_envs.kinds import is_number
+from quad_envs.names import shown
+from quad_envs.parameters import Array
+
+from ..errors import ResultsError, TrainingError
+from ..evaluation.evaluate import fly_and_measure
+from ..files import locked, plain_json, provenance, read_json, write_csv, write_json
+from ..interruptions import held, raise_lost, remembered
+from ..policies.registry import make_policy
+from ..policies.tuned import DESCRIPTION, TunedPolicy, vehicle_of, write_tuned
+from .clock import TrainingClock
+from .held_out import HELD_OUT, HeldOutFlights, Point, Progress, read_point, training_options
+from .tuned_options import Search, make_search
+from .watching import Watcher
+
+Objective = Literal["score", "quadratic_cost"]
+FLIGHTS = 8  # of a candidate
+_SECONDS = 60.0  # budget, CPU-seconds
+_SPREAD = 0.3  # decades, of the first generation
+_VIOLATING = 10.0  # score that a flight loses if all its steps violate: limits come before the score
+_CRASHED = 1e3  # beside any cost
+_FILES = (DESCRIPTION, "curve.csv", "last.json", "config.json")
+
+
+@dataclass(frozen=True, slots=True)
+class TuningRequest:
+    """The arguments of `tune`; the comment of a field is its documentation everywhere."""
+
+    env_id: str  # id of the task
+    policy: str  # a name of `make_policy` with options that can be tuned
+    _: KW_ONLY
+    objective: Objective = "score"  # what is better: a higher score, or a lower "quadratic_cost"
+    seed: int = 0  # of the search and its starts, 0 to 99
+    seconds: float | None = None  # budget in CPU-seconds of the search; 60 if neither this nor `episodes`
+    episodes: int | None = None  # budget in episodes instead
+    fields: Sequence[
+        str
+    ] = ()  # options to tune; all of Q, R, R_rate, ... that mean something if none is given
+    out: str | Path | None = None  # folder; runs/tuned-POLICY-TASK-SEED if not given
+    env_kwargs: Mapping[str, Any] | None = None  # of the environment
+    options: Mapping[str, Any] | None = None  # of the policy, with which the search begins
+    resume: bool = False  # go on with the search in the folder until the whole budget is used
+    fresh: bool = False  # discard the search that is in the folder
+    watcher: Watcher | None = None  # hears of the progress
+
+    def __post_init__(self) -> None:
+        require_choice("objective", self.objective, Objective)
+        require_whole("seed of a tuning", self.seed, 0, 99)
+        if self.resume and self.fresh:
+            raise ValueError("either resume or fresh: a search that is discarded cannot go on")
+        if self.seconds is not None and self.episodes is not None:
+            raise ValueError("the budget is either seconds (CPU-seconds) or episodes, not both")
+        if self.seconds is not None and not (is_number(self.seconds) and self.seconds > 0.0):
+            raise ValueError(f"seconds of a tuning must be a number > 0, got {shown(self.seconds)}")
+        if self.episodes is not None:
+            require_whole("episodes of a tuning", self.episodes, 1)
+
+    @property
+    def folder(self) -> Path:
+        """Where it goes."""
+        task = self.env_id.rsplit("/", 1)[-1].removesuffix("-v0")
+        return Path(self.out or Path("runs") / f"tuned-{self.policy}-{task}-{self.seed}")
+
+
+@dataclass(frozen=True, slots=True)
+class TuningResult:
+    """What a tuning gave."""
+
+    folder: Path  # which `make_policy` takes
+    policy: str
+    options: dict[str, Any]  # of the best
+    best: Point
+    curve: tuple[Point, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain values."""
+        return {
+            "folder": str(self.folder),
+            "policy": self.policy,
+            "options": self.options,
+            "best": self.best._asdict(),
+            "curve": [point._asdict() for point in self.curve],
+        }
+
+
+@called_with(TuningRequest)
+def tune(request: TuningRequest) -> TuningResult:
+    """Tune the options of a controller, and leave a folder that `make_policy` takes.
+
+    Training starts have seeds below 10 000; those of tables are never seen. Violations and crashes count more
+    than any score. Equal seeds and a budget in episodes give equal results. Ctrl-C keeps what is finished.
+
+    Raises:
+        ValueError: If an argument is not allowed, or the policy has nothing to tune.
+        ResultsError: If the folder is in use, holds another search, or cannot be written.
+        TrainingError: If no candidate stays in the air.
+    """
+    return run_tuning(request)
+
+
+def run_tuning(request: TuningRequest) -> TuningResult:
+    """Do what is asked for, see `tune`."""
+    kwargs = dict(request.env_kwargs or {})
+    training_options(request.env_id, kwargs)  # says what is wrong with an argument
+    held_out = HeldOutFlights(request.env_id, kwargs)
+    search = make_search(request.policy, held_out.task, request.options or {}, request.fields)
+    make_policy(request.policy, held_out.task, **search.options(np.zeros(search.size)))
+    path = request.folder
+    with remembered(), locked(path):
+        run = _Run(request, search, held_out)
+        run.go()
+        best = run.best()
+        return TuningResult(path, request.policy, search.options(run.best_z), best, tuple(run.curve))
+
+
+def loss_of(summary: Mapping[str, Any], crashes: int, objective: Objective) -> float:
+    """What a candidate is minimised by.
+
+    Args:
+        summary: Of its flights.
+        crashes: Number of flights that crashed.
+        objective: Score or cost; of a cost its logarithm counts.
+    """
+    value = -summary["score"].mean
+    if objective == "quadratic_cost":
+        cost = summary["quadratic_cost"].mean
+        value = math.log(cost) if cost > 0.0 else 0.0
+    return float(value + _VIOLATING * summary["violation_share"].mean + _CRASHED * crashes)
+
+
+class _Run:
+    """One session of a search."""
+
+    def __init__(self, request: TuningRequest, search: Search, held_out: HeldOutFlights) -> None:
+        from cmaes import CMA
+
+        self.request, self.search, self.held_out, self.path = request, search, held_out, request.folder
+        self.about = {
+            "tuning": 1,
+            "env_id": held_out.task.env_id,
+            "env_kwargs": plain_json(dict(request.env_kwargs or {})),
+            "policy": request.policy,
+            "options": plain_json(search.given),
+            "fields": list(search.names),
+            "objective": request.objective,
+            "seed": request.seed,
+        }
+        self.curve: list[Point] = []
+        self.best_z, self.best_loss, mean = np.zeros(search.size), math.inf, np.zeros(search.size)
+        seconds, self.generation, self.episodes = 0.0, 0, 0
+        sigma = _SPREAD
+        if request.resume:
+            last = self._read()
+            mean, self.best_z = np.array(last["mean"]), np.array(last["best"])
+            self.best_loss, sigma = last["loss"], last["sigma"]
+            seconds, self.generation, self.episodes = last["seconds"], last["generation"], last["episodes"]
+        self.clock = TrainingClock(seconds)
+        seed = 1000 * request.seed + self.generation
+        self.cma = CMA(mean=mean, sigma=sigma, bounds=search.bounds, seed=seed)
+        self._require_a_generation()
+        if not request.resume:
+            self._begin()
+        self.env: Any = gymnasium.make_vec(
+            request.env_id.removeprefix("quad_envs:"), num_envs=FLIGHTS, **dict(request.env_kwargs or {})
+        )
+
+    def best(self) -> Point:
+        """The best judged candidate."""
+        return min(self.curve, key=self._judged_loss)
+
+    def share(self) -> float:
+        """Share of the budget that is used up."""
+        if self.request.episodes is not None:
+            return float(self.episodes + self._least() - 1) / self.request.episodes
+        return self.clock.seconds / (self.request.seconds or _SECONDS)
+
+    def go(self) -> None:
+        """Search until the budget is used up."""
+        watcher = self.request.watcher
+        try:
+            if not self.curve:
+                self._judge(np.zeros(self.search.size))
+            while self.share() < 1.0:
+                raise_lost()
+                with self.clock.running():
+                    asked = [(z, self._loss(z)) for z in self._candidates()]
+                    self.cma.tell(asked)
+                self.generation += 1
+                self.episodes += FLIGHTS * len(asked)
+                if watcher is not None:
+                    watcher.updated(self.share(), None)
+                self._judge(min(asked, key=lambda pair: pair[1])[0])
+        finally:
+            if watcher is not None:
+                watcher.close()
+        if self.best().crashes >= self.best().flights:
+            raise TrainingError(
+                f"no candidate for {self.request.policy!r} stays in the air on {self.request.env_id}: all "
+                f"{self.best().flights} flights of the best one crash; begin from options that fly "
+                f"(--policy-set), or make the task easier. What was tried is kept in {str(self.path)!r}"
+            )
+
+    def _candidates(self) -> list[Array]:
+        return [self.cma.ask() for _ in range(self.cma.population_size)]
+
+    def _loss(self, z: Array) -> float:
+        """Of a candidate, on the starts of this generation."""
+        starts = HELD_OUT // 100
+        seed = starts * self.request.seed + FLIGHTS * self.generation % (starts - FLIGHTS)
+        policy = make_policy(self.request.policy, self.held_out.task, **self.search.options(z))
+        found = fly_and_measure(policy, self.env, FLIGHTS, seed)
+        crashes = sum(bool(record.crashed) for record in found.records)
+        return loss_of(found.summary(), crashes, self.request.objective)
+
+    def _judged_loss(self, point: Point) -> float:
+        value = -point.score
+        if self.request.objective == "quadratic_cost":
+            value = math.log(point.quadratic_cost) if point.quadratic_cost > 0.0 else math.inf
+        if not math.isfinite(value):
+            value = 0.0
+        return value + _VIOLATING * point.violation_share + _CRASHED * point.crashes
+
+    def _judge(self, z: Array) -> None:
+        """Judge a candidate on held-out starts, and save."""
+        policy = make_policy(self.request.policy, self.held_out.task, **self.search.options(z))
+        progress = Progress(self.generation, self.held_out.task.episode_steps * self.episodes, math.nan)
+        point = self.held_out.judge_policy(policy, self.clock.seconds, progress)
+        loss = self._judged_loss(point)
+        best = loss < self.best_loss
+        with held():  # what is judged is saved, or neither
+            self.curve.append(point)
+            if best:
+                self.best_z, self.best_loss = z, loss
+                tuned = TunedPolicy(
+                    self.request.policy,
+                    self.search.options(z),
+                    self.held_out.task.env_id,
+                    vehicle_of(self.held_out.task),
+                )
+                write_tuned(self.path, tuned, {**self.about, **point._asdict(), **tuned._asdict()})
+            write_csv(self.path / "curve.csv", [each._asdict() for each in self.curve])
+            write_json(self.path / "last.json", self._last())
+        if self.request.watcher is not None:
+            self.request.watcher.judged(point, best)
+
+    def _last(self) -> dict[str, Any]:
+        found: dict[str, Any] = plain_json(
+            {
+                "mean": self.cma.mean,
+                "sigma": float(self.cma._sigma),
+                "best": self.best_z,
+                "loss": self.best_loss,
+                "seconds": self.clock.seconds,
+                "generation": self.generation,
+                "episodes": self.episodes,
+            }
+        )
+        return found
+
+    def _least(self) -> int:
+        """Episodes of a generation."""
+        return FLIGHTS * int(self.cma.population_size)
+
+    def _require_a_generation(self) -> None:
+        least, asked = self._least(), self.request.episodes
+        if asked is not None and asked < least:
+            raise ValueError(
+                f"a tuning of {asked} episode{'s' * (asked != 1)} cannot compare anything: one generation of "
+                f"{self.cma.population_size} candidates flies {least}; give --episodes {least} or more, or "
+                "tune fewer options (--tuned)"
+            )
+
+    def _config(self) -> dict[str, Any] | None:
+        path = self.path / "config.json"
+        if not path.exists():
+            return None
+        found = read_json(path)
+        if isinstance(found, dict) and found.get("tuning"):
+            return found
+        raise ResultsError(
+            f"{str(self.path)!r} holds a config.json that no tuning wrote; choose another folder"
+        )
+
+    def _begin(self) -> None:
+        """Make the folder ready for a new search."""
+        found = self._config()
+        foreign = [name for name in _FILES if (self.path / name).exists()]
+        if found is None and foreign:
+            raise ResultsError(
+                f"{str(self.path)!r} holds a {foreign[0]} of something else; choose another folder"
+            )
+        if found is not None and not self.request.fresh and (self.path / "last.json").exists():
+            raise ResultsError(
+                f"{str(self.path)!r} holds a tuning of {found['policy']} on {found['env_id']}: go on with it "
+                "(--resume), discard it (--fresh), or choose another folder"
+            )
+        for name in _FILES:
+            (self.path / name).unlink(missing_ok=True)
+        write_json(self.path / "config.json", {**self.about, **provenance()})
+
+    def _read(self) -> dict[str, Any]:
+        """Where the search in the folder goes on."""
+        import csv
+
+        found = self._config()
+        if found is None or not (self.path / "last.json").exists():
+            raise ResultsError(
+                f"{str(self.path)!r} holds no tuning that could be resumed; leave --resume out"
+            )
+        for name, value in self.about.items():
+            if found.get(name) != value:
+                raise ResultsError(
+                    f"{str(self.path)!r} holds another tuning: its {name} is {json.dumps(found.get(name))}, "
+                    f"asked for is {json.dumps(value)}; give the same, or choose another folder"
+                )
+        with open(self.path / "curve.csv", newline="") as file:
+            self.curve = [read_point(row) for row in csv.DictReader(file)]
+        last: dict[str, Any] = read_json(self.path / "last.json")
+        return last
