@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-HERE = Path(__file__).parent.parent
+from .turns import HERE, at_work
+
 POLICIES = ("lmpc", "sdc-nmpc", "nmpc")
 _FLIGHTS = """
 import json, sys
@@ -49,42 +45,18 @@ class Pair(NamedTuple):
     there: float
 
 
-@contextmanager
-def _flying(checkout: Path) -> Iterator[subprocess.Popen[str]]:
-    """A process that flies what each line asks for, and says how long the decisions took."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", _FLIGHTS],
-        cwd=checkout,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    with process:
-        yield process
-        assert process.stdin is not None
-        process.stdin.close()
-
-
-def _ask(process: subprocess.Popen[str], *what: Any) -> list[float]:
-    assert process.stdin is not None and process.stdout is not None
-    process.stdin.write(json.dumps(what) + "\n")
-    process.stdin.flush()
-    taken: list[float] = json.loads(process.stdout.readline())
-    return taken
-
-
 def decisions_beside(other: Path, rows: int, steps: int, repetitions: int) -> dict[str, Pair]:
     """CPU-us per row: p50 of single decisions, and the mean of batches of so many rows.
 
     Flights repeat exactly; of each decision the shortest time counts.
     """
     found = {}
-    with _flying(HERE) as ours, _flying(other) as theirs:
+    with at_work(HERE, _FLIGHTS) as ours, at_work(other, _FLIGHTS) as theirs:
         for name in POLICIES:
             for scene in ("nominal", "tight"):
                 for n in (1, rows):
                     taken = [
-                        [_ask(process, name, scene, n, steps) for process in (ours, theirs)]
+                        [process.ask(name, scene, n, steps) for process in (ours, theirs)]
                         for _ in range(repetitions + 1)  # the first compiles
                     ]
                     shortest = np.min(taken[1:], axis=0)

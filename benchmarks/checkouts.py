@@ -9,14 +9,13 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
+from .turns import HERE, at_work
+
 ENV_ID = "quad/HelixTracking-v0"
-HERE = Path(__file__).parent.parent
 SHARES = (0.1, 0.2, 0.3, 0.5, 0.75, 1.0)  # of the budget, at which curves are compared
 _UPDATES = """
 import sys
@@ -41,32 +40,13 @@ print(json.dumps([[point.steps, point.score, point.cpu_seconds] for point in cur
 """
 
 
-@contextmanager
-def _updating(checkout: Path, rows: int) -> Iterator[subprocess.Popen[str]]:
-    """A process that makes an update for each line it is given, and says how many steps per CPU-second."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", _UPDATES, str(rows)],
-        cwd=checkout,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    with process:
-        yield process
-        assert process.stdin is not None
-        process.stdin.close()
-
-
 def update_rates(other: Path, rows: int, repetitions: int) -> tuple[float, float]:
     """Steps per CPU-second of PPO here and there, best of the repetitions, which take turns."""
     best = [0.0, 0.0]
-    with _updating(HERE, rows) as ours, _updating(other, rows) as theirs:
+    with at_work(HERE, _UPDATES, str(rows)) as ours, at_work(other, _UPDATES, str(rows)) as theirs:
         for _ in range(repetitions):
             for k, process in enumerate((ours, theirs)):
-                assert process.stdin is not None and process.stdout is not None
-                process.stdin.write("\n")
-                process.stdin.flush()
-                best[k] = max(best[k], float(process.stdout.readline()))
+                best[k] = max(best[k], float(process.ask()))
     return best[0], best[1]
 
 

@@ -33,7 +33,8 @@ from baselines.training.tanh import tanh_in_place  # noqa: E402
 from quad_envs.envs.tracking.options import TrackingOptions  # noqa: E402
 from quad_envs.registration import TRACKING  # noqa: E402
 
-from .checkouts import ENV_ID, HERE, SHARES, curve, update_rates  # noqa: E402
+from .checkouts import ENV_ID, SHARES, curve, update_rates  # noqa: E402
+from .turns import HERE  # noqa: E402
 
 PPO_GOAL = 55_000.0  # steps per CPU-second
 ROLLOUT_GOAL = 2.5  # times DummyVecEnv

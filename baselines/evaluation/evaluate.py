@@ -193,17 +193,8 @@ def fly_and_measure(
     Flights go side by side where there is a row form, see `row_forms`. Only numbers are kept of each. A team
     gives one record per vehicle and flight; means and intervals are over flights.
 
-    Args:
-        policy: Anything with `predict`, or what `make_policy` takes.
-        env: An id, a Gymnasium environment or a ParallelEnv, or a vector environment (decisions are not
-            timed).
-        episodes: Number of flights, >= 1.
-        seed: Flight i starts with the environment seed `seed + i`.
-        on_episode: Called with each flight, of a team with that of each vehicle, to save or plot it.
-        mismatch: Whether the policy may be one of another task on purpose, see `run_episodes`. Conditions
-            with `randomize` need it not: the task knows the nominal vehicle.
-        timed: Decision times that `time_decisions` has found; None to find them now, where flights go side by
-            side.
+    The arguments are those of `baselines.evaluate`. `timed` are decision times that `time_decisions` has
+    found; None to find them now, where flights go side by side.
 
     Raises:
         ValueError: If the id or the policy's name is unknown, episodes < 1, or as `run_episodes` says.

@@ -14,6 +14,7 @@ from quad_envs.limits import Limits
 from quad_envs.packed import pack
 from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, RATES, Array
 from quad_envs.tasks import BaseTask, Task
+from quad_envs.threads import Threads
 
 from ..controller import (
     Decision,
@@ -44,7 +45,6 @@ from .kernels import (
     left_model,
 )
 from .options import PLAN_TILT, MpcOptions, VelocityAxes
-from .threads import Threads
 from .weights import change_weight, require_turnable, terminal_weight, weight_matrix
 
 PLAN_WEIGHT = 1e4  # per rad, rad/s: of rows that keep a plan in its model; 1e3 gives way to heavy positions
@@ -373,5 +373,4 @@ class Mpc(ABC):
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but scratch memory and the backend's, which are made again when needed."""
-        threads = Threads(self._threads.count)
-        return {**self.__dict__, "_memories": [], "_threads": threads, "_backend": None}
+        return {**self.__dict__, "_memories": [], "_backend": None}

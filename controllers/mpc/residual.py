@@ -9,8 +9,6 @@ from quad_envs.rotations import sincos, wrap_angle_scalar
 from ..model import rotated_derivatives
 from ..qp.linalg import copy
 
-RESIDUAL_ROWS = 6  # of D: those of V_B, then those of Omega
-
 
 @kernel
 def velocity_residual(Theta: Array, v_ref: Array, D: Array) -> tuple[float, float, float]:

@@ -15,9 +15,6 @@ from ...constraints import constraint_scales
 from ...formations import start_positions
 from ...graphs import in_neighbours
 from ...lanes import (
-    COEFFICIENTS,
-    DECAY,
-    FORCE_MAX,
     LANES,
     MEASURES,
     MOST_VALUES,
@@ -28,13 +25,14 @@ from ...lanes import (
 from ...names import nearest_name, shown, unknown_name
 from ...observations.tracking import N_REFERENCE
 from ...packed import IntArray, pack
-from ...parameters import ROTOR_RATE
 from ...plant import N_STATE, Array
 from ...references import make_reference, pack_rows
 from ...sensors import sensor_rows
 from ...table_row import N_TABLE
 from ...targets import N_TARGET, make_target
+from ...tasks import TeamTask
 from ..shared.given import given_plants
+from ..shared.packed_batch import PackedBatch
 from ..shared.tables import checked_rows, disturbance_rows, draw_vehicle, reference_rows, stage_times
 from ..shared.task_vector import task_vector
 from .exchange import DISTURBANCE, DRAW, HEAD, NOISE, PLAN, REFERENCE, TARGET, Tables
@@ -48,11 +46,14 @@ Generators = Sequence[np.random.Generator]
 _RESET_OPTIONS = ("state",)
 
 
-class TeamBatch:
+class TeamBatch(PackedBatch):
     """`teams` independent flights of one multi-agent task; vehicle i of team t is row t N + i.
 
     The public arrays are views for reading; `begin` and `step` change them.
     """
+
+    options: TeamOptions
+    task: TeamTask
 
     def __init__(self, options: TeamOptions, teams: int) -> None:
         self.options, self.teams, self.task = options, teams, options.task
@@ -101,17 +102,6 @@ class TeamBatch:
                 for i in options.informed():
                     self.vehicles.write(MEASURES, np.ones(1), t * self.n + i)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key != "_words"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._words = pack(self._arrays)
-
-    def fresh_scores(self) -> Array:
-        """Where `begin` and `step` write their scores, see `kernel.N_TOLD`."""
-        return np.empty(self._told_shape)
-
     def parts(self, told: Array) -> Parts:
         """What is told there, kind by kind."""
         return parts_of(told, self._constraints)
@@ -119,13 +109,6 @@ class TeamBatch:
     def scores(self, told: Array) -> TeamScores:
         """What is told there."""
         return team_scores(told, self._constraints)
-
-    def _place(self, vehicle: Array, force_max: Array, i: int | None = None) -> None:
-        """Which vehicle flies in place i, or in all: coefficients, and the largest force of each rotor."""
-        half = 0.5 * self.task.dt / self.options.substeps
-        self.vehicles.write(COEFFICIENTS, vehicle, i)
-        self.vehicles.write(FORCE_MAX, force_max, i)
-        self.vehicles.write(DECAY, np.exp(-half * vehicle[ROTOR_RATE : ROTOR_RATE + 1]), i)
 
     def _take_choices(self) -> None:
         """What is flown, and which of it is drawn at reset."""

@@ -11,17 +11,18 @@ from numpy.typing import NDArray
 from ..._numba import entry_of
 from ...checks import array_bytes, require_memory
 from ...disturbances import Disturbance
-from ...lanes import COEFFICIENTS, DECAY, FORCE_MAX, LANES, N_PLANT, N_TRACKING, Blocks
+from ...lanes import LANES, N_PLANT, N_TRACKING, Blocks
 from ...names import shown
 from ...packed import IntArray, pack
-from ...parameters import ROTOR_RATE
 from ...plant import N_STATE, POSITION, Array
 from ...references import Reference, make_reference, state_on
 from ...table_row import N_TABLE
+from ...tasks import Task
+from ...threads import Threads
 from ..shared.given import given_plants
+from ..shared.packed_batch import PackedBatch
 from ..shared.tables import disturbance_rows, draw_vehicle, reference_rows, stage_times
 from ..shared.task_vector import task_vector
-from ..shared.workers import Workers
 from .kernel import N_TOLD, Flights, begin_flights, step_flights, tell_flights
 from .options import TrackingOptions
 from .scores import Scores, scores_of
@@ -30,11 +31,14 @@ _step, _begin, _tell = entry_of(step_flights), entry_of(begin_flights), entry_of
 Generators = Sequence[np.random.Generator]
 
 
-class TrackingBatch:
+class TrackingBatch(PackedBatch):
     """n independent flights of one task.
 
     The public arrays are views for reading; `begin` and `step` change them.
     """
+
+    options: TrackingOptions
+    task: Task
 
     def __init__(self, options: TrackingOptions, n: int, threads: int = 1) -> None:
         self.options, self.n, self.task = options, n, options.task
@@ -91,18 +95,7 @@ class TrackingBatch:
         self._words = pack(self._arrays)
         self._blocks = self.vehicles.count
         threads = min(threads, self._blocks)
-        self._workers = Workers(threads) if threads > 1 else None
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key != "_words"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._words = pack(self._arrays)
-
-    def fresh_scores(self) -> Array:
-        """Where `begin`, `step` and `tell` write their scores, see `kernel.N_TOLD`."""
-        return np.empty(self._told_shape)
+        self._threads = Threads(threads) if threads > 1 else None
 
     def scores(self, told: Array) -> Scores:
         """What is told there."""
@@ -164,13 +157,6 @@ class TrackingBatch:
             rng.standard_normal(out=self.noises[i])
             self.noises[i] *= self._noise
 
-    def _place(self, vehicle: Array, force_max: Array, i: int | None = None) -> None:
-        """Which vehicle flies in flight i, or in all: coefficients, and the largest force of each rotor."""
-        half = 0.5 * self.task.dt / self.options.substeps
-        self.vehicles.write(COEFFICIENTS, vehicle, i)
-        self.vehicles.write(FORCE_MAX, force_max, i)
-        self.vehicles.write(DECAY, np.exp(-half * vehicle[ROTOR_RATE : ROTOR_RATE + 1]), i)
-
     def tell(self, index: IntArray, out: NDArray[np.float32], told: Array) -> None:
         """Write observations and scores of flights as they are; arguments as in `begin`."""
         _tell(self._words, index, out, told)
@@ -193,10 +179,10 @@ class TrackingBatch:
         Raises:
             ValueError: If an action is not finite; then no flight has moved.
         """
-        if self._workers is None:
+        if self._threads is None:
             ended = _step(self._words, actions, out, told, 0, self._blocks)
         else:
-            ended = self._workers.run(_step, self._blocks, self._words, actions, out, told)
+            ended = self._step_in_threads(self._threads, actions, out, told)
         if ended < 0:
             bad = -1 - ended
             where = f"[{bad}]" if self.n == 1 else f"[{bad // 4}, {bad % 4}]"
@@ -205,6 +191,16 @@ class TrackingBatch:
                 "The environment has not moved."
             )
         return ended
+
+    def _step_in_threads(
+        self, threads: Threads, actions: NDArray[np.float32], out: NDArray[np.float32], told: Array
+    ) -> int:
+        """As the kernel of `step`; each thread moves an equal share of the blocks."""
+        cuts = [self._blocks * k // threads.count for k in range(threads.count + 1)]
+        found = threads.each(
+            lambda thread: _step(self._words, actions, out, told, cuts[thread], cuts[thread + 1])
+        )
+        return min(found) if min(found) < 0 else sum(found)
 
     def given_states(self, options: Mapping[str, Any] | None) -> Array | None:
         """The plant (16,) of the reset options, if there is one.

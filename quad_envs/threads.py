@@ -1,12 +1,14 @@
-"""Threads that share the rows of a batch; what is decided for a row does not depend on their number."""
+"""Threads that share the work on a batch; what is computed does not depend on their number."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
+from typing import Any, TypeVar
 
 _SHARE = 16  # rows at a time at most: a row with many active constraints takes longer than others
+_Result = TypeVar("_Result")
 
 
 class Threads:
@@ -20,6 +22,26 @@ class Threads:
         self.count = count
         self._pool: ThreadPoolExecutor | None = None
         self._process = 0  # to which the pool belongs: a fork has none of its threads
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"count": self.count, "_pool": None, "_process": 0}
+
+    def each(self, work: Callable[[int], _Result], most: int | None = None) -> list[_Result]:
+        """What work(thread) returns, or raises, in each thread at once; the calling one is number 0.
+
+        Args:
+            work: Called once in each thread.
+            most: Of them at the most; None for all.
+        """
+        if self._pool is None or self._process != os.getpid():
+            self._pool, self._process = ThreadPoolExecutor(self.count - 1, "quad_envs"), os.getpid()
+        taking_part = self.count if most is None else min(self.count, most)
+        others = [self._pool.submit(work, thread) for thread in range(1, taking_part)]
+        try:
+            own = work(0)
+        finally:
+            wait(others)  # nobody still writes when this returns
+        return [own, *(other.result() for other in others)]
 
     def run(self, rows: int, work: Callable[[int, int, int], int]) -> int:
         """Let the threads work until all rows are done; each takes the next few when it has done its last.
@@ -42,12 +64,4 @@ class Threads:
                     return code
             return -1
 
-        if self._pool is None or self._process != os.getpid():
-            self._pool, self._process = ThreadPoolExecutor(self.count - 1, "decide"), os.getpid()
-        others = [self._pool.submit(go, thread) for thread in range(1, min(self.count, rows))]
-        try:
-            own = go(0)
-        finally:
-            wait(others)  # nobody still writes when this returns
-        codes = [own, *(other.result() for other in others)]
-        return min((code for code in codes if code >= 0), default=-1)
+        return min((code for code in self.each(go, rows) if code >= 0), default=-1)
