@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.dynamics import arrive, disturbed_substep, place_vehicle, rotor_shares, set_out
 from quad_envs.lanes import AIR_FIRST, AIR_LAST, AIR_MIDDLE, COMMAND, FINITE, LANES, N_FLIGHT, PLANT
 from quad_envs.parameters import (

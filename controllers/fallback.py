@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.parameters import N_INPUT, Array
 
 

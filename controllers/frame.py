@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 from quad_envs.rotations import sincos, wrap_angle_scalar
 from quad_envs.tasks import BaseTask

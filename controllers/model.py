@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quad_envs._numba import inline_kernel, kernel
+from quad_envs.compilation.decorators import inline_kernel, kernel
 from quad_envs.dynamics import rigid_body
 from quad_envs.parameters import (
     DRAG_RATE,

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ._numba import inline_kernel, kernel
+from .compilation.decorators import inline_kernel, kernel
 from .dynamics import rigid_body, rotor_limits
 from .names import shown
 from .parameters import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ._numba import inline_kernel, kernel
+from .compilation.decorators import inline_kernel, kernel
 from .limits import Limits
 from .plant import N_INPUT, N_STATE, Array
 

@@ -14,8 +14,8 @@ from typing import Any, ClassVar, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ._numba import kernel
 from .authority import hover_authority
+from .compilation.decorators import kernel
 from .kinds import as_tuple, is_number, make_kind, refuse_class, without_booleans
 from .limits import Limits
 from .names import shown, unknown_name

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ._numba import Int, fused, inline_kernel, inline_lane_kernel, kernel, lane_kernel
+from .compilation.decorators import Int, fused, inline_kernel, inline_lane_kernel, kernel, lane_kernel
 from .lanes import (
     AIR_FIRST,
     AIR_LAST,

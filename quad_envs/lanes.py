@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ._numba import Int, inline_kernel, inline_lane_kernel
+from .compilation.decorators import Int, inline_kernel, inline_lane_kernel
 from .limits import LIMITS
 from .parameters import N_COEFFICIENTS
 from .plant import N_INPUT, N_STATE, Array

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ._numba import inline_kernel
+from .compilation.decorators import inline_kernel
 from .parameters import Array, Weights
 from .rotations import rotation_body_from_inertial, sincos, wrap_angle, wrap_angle_scalar
 from .table_row import HEADING, TURN_RATE

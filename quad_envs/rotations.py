@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ._numba import inline_kernel
+from .compilation.decorators import inline_kernel
 from .parameters import Array
 
 _TWO_OVER_PI = 2.0 / np.pi

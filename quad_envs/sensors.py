@@ -29,7 +29,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ._numba import Int, inline_kernel
+from .compilation.decorators import Int, inline_kernel
 from .names import unknown_name
 from .parameters import Array
 

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ._numba import inline_kernel, kernel
+from .compilation.decorators import inline_kernel, kernel
 from .plant import Array
 from .rotations import wrap_angle
 from .table_row import HEADING, N_REFERENCE, N_TABLE

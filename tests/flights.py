@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.dynamics import arrive, disturbed_substep, load_air, place_vehicle, set_out
 from quad_envs.lanes import COMMAND, LANES, N_FLIGHT, PLANT
 from quad_envs.parameters import Limits

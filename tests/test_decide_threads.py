@@ -10,7 +10,7 @@ import pytest
 
 import quad_envs  # noqa: F401  registers the ids
 from baselines import make_policy
-from quad_envs.threads import Threads
+from quad_envs.compilation.threads import Threads
 
 MPCS = ("lmpc", "sdc-nmpc", "nmpc")
 TIGHT = {"kappa": 0.3125, "rate_limit": 5.0, "start_box": 3.0}

@@ -6,7 +6,7 @@ from scipy.optimize import minimize
 
 from controllers.estimation.fusion import covariance_intersection, fuse_point, fuse_reference
 from controllers.estimation.fusion_kernels import CI_WEIGHTS
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 
 RNG = np.random.default_rng(0)
 

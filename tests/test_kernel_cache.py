@@ -17,8 +17,8 @@ from numba import float32, float64, njit
 from numba.core import config
 from numba.core.registry import cpu_target
 
-from quad_envs import _kernel_cache as cache
-from quad_envs._numba import kernel
+from quad_envs.compilation import cache
+from quad_envs.compilation.decorators import kernel
 
 SOURCE = """
 from enum import IntEnum
@@ -293,7 +293,7 @@ EVERYTHING = """
 import sys
 from typing import NamedTuple
 import numpy as np
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 
 class Pair(NamedTuple):
     table: np.ndarray
@@ -361,14 +361,14 @@ def test_two_processes_that_compile_at_once_leave_whole_files(tmp_path):
 
 
 def test_a_kernel_that_calls_what_is_not_there_is_compiled_anew(tmp_path, monkeypatch):
-    from quad_envs import _kernel_file
+    from quad_envs.compilation import kernel_file
 
     assert fresh_kernel(tmp_path, monkeypatch)(1.5) == 3.0
     (file,) = tmp_path.iterdir()
     packed = file.read_bytes()[cache._HEADER :]
     with pytest.raises(ValueError, match="needs no_such_function"):
-        monkeypatch.setattr(_kernel_file, "_missing", lambda needed: ["no_such_function"])
-        _kernel_file.unpack(packed, cpu_target.target_context)
+        monkeypatch.setattr(kernel_file, "_missing", lambda needed: ["no_such_function"])
+        kernel_file.unpack(packed, cpu_target.target_context)
     again = fresh_kernel(tmp_path, monkeypatch)
     assert again(1.5) == 3.0 and sum(again.entry.stats.cache_misses.values()) == 1
 
@@ -383,7 +383,7 @@ print(float(reward).hex(), observation.tobytes().hex())
 
 
 @pytest.mark.slow  # compiles the environment's kernels in numba's plain way
-@pytest.mark.parametrize("module", ["quad_envs._nested", "quad_envs._kernel_file"])
+@pytest.mark.parametrize("module", ["quad_envs.compilation.nested", "quad_envs.compilation.kernel_file"])
 def test_without_the_private_names_of_numba_a_step_is_the_same_and_one_warning_says_why(module):
     hide = f"import sys\nsys.modules[{module!r}] = None\n"
     run = [
@@ -399,20 +399,20 @@ def test_a_private_name_that_is_missing_is_found_at_the_import_and_named(monkeyp
     from numba.core.codegen import CPUCodeLibrary
 
     monkeypatch.delattr(CPUCodeLibrary, "_finalize_dynamic_globals")
-    monkeypatch.delitem(sys.modules, "quad_envs._nested")
+    monkeypatch.delitem(sys.modules, "quad_envs.compilation.nested")
     with pytest.raises(ImportError, match=r"no CPUCodeLibrary\._finalize_dynamic_globals"):
-        importlib.import_module("quad_envs._nested")
+        importlib.import_module("quad_envs.compilation.nested")
 
 
 def test_two_nested_kernels_give_the_same_nested_and_plain(monkeypatch):
-    from quad_envs import _numba
+    from quad_envs.compilation import decorators
 
     def build():
-        inner = _numba.kernel(lambda x: x * x + 1.0)
-        return _numba.kernel(lambda x: inner(x) / 3.0)
+        inner = decorators.kernel(lambda x: x * x + 1.0)
+        return decorators.kernel(lambda x: inner(x) / 3.0)
 
     nested = build()
-    monkeypatch.setattr(_numba, "NestedKernel", None)
+    monkeypatch.setattr(decorators, "NestedKernel", None)
     plain = build()
     assert type(nested) is not type(plain)
     for x in (0.0, -2.5, np.inf):

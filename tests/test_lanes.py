@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from quad_envs import Gusts, Steady
-from quad_envs._intrinsics import take_nearer
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
+from quad_envs.compilation.intrinsics import take_nearer
 from quad_envs.constraints import (
     TOLERANCE,
     constraint_scales,

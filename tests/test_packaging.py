@@ -4,7 +4,7 @@ import sys
 from fnmatch import fnmatch
 from pathlib import Path
 
-from quad_envs._portable import SHIPPED
+from quad_envs.compilation.portable import SHIPPED
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from controllers.qp.ocp import IntArray
-from quad_envs._numba import kernel
-from quad_envs.packed import pack, unpacker
+from quad_envs.compilation.decorators import kernel
+from quad_envs.compilation.packed import pack, unpacker
 from quad_envs.parameters import Array
 
 

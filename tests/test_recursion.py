@@ -20,7 +20,7 @@ from controllers.qp.products import (
     transpose,
 )
 from controllers.qp.recursion import RECURSION_SCRATCH, Feedback, Regulator, optimal_plan, riccati_pass
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.parameters import QuadrotorParams
 
 VIOLENT = np.repeat([3.0, 6.0, 1.5, 12.0], 3)  # a violent state: 6 m/s, upside down, 700 deg/s

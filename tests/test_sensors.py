@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.sensors import (
     MIN_HORIZONTAL_SQUARED,
     OVERHEAD,

@@ -88,8 +88,8 @@ def _cache() -> Finding:
     """Whether compiled kernels can be kept."""
     from numba.core import config
 
-    from quad_envs._kernel_cache import folder, runs_shipped
-    from quad_envs._portable import SHIPPED
+    from quad_envs.compilation.cache import folder, runs_shipped
+    from quad_envs.compilation.portable import SHIPPED
 
     if getattr(config, "DISABLE_JIT", False):
         return Finding("cache", False, "kernels are not compiled: unset NUMBA_DISABLE_JIT")

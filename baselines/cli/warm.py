@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 
-from quad_envs._portable import settings
 from quad_envs.checks import require_whole
+from quad_envs.compilation.portable import settings
 
 from .options import WarmOptions
 

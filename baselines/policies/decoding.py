@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.envs.team.kernel import PLAN_SCALE
 from quad_envs.observations.team import N_PLAN_STAGE, AgentLayout
 from quad_envs.observations.tracking import decode_own

@@ -17,7 +17,7 @@ from controllers.estimation.trilateration_kernels import (
     trilaterate_kernel,
 )
 from controllers.team.consensus_kernels import inertial_velocity, turn_to_inertial
-from quad_envs._numba import Int, kernel
+from quad_envs.compilation.decorators import Int, kernel
 from quad_envs.observations.team import COMM_AGE, N_MEASURED
 from quad_envs.parameters import DRAG_RATE, GRAVITY, INV_MASS, Array
 from quad_envs.sensors import AZIMUTH, RANGE, reads

@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_envs._numba import entry_of
+from quad_envs.compilation.decorators import entry_of
 from quad_envs.encoding import Encoding, hover_actions, hover_gains
 from quad_envs.names import shown
 from quad_envs.observations.features import Features

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_envs._numba import inline_kernel, kernel
+from quad_envs.compilation.decorators import inline_kernel, kernel
 from quad_envs.parameters import Array
 
 from .rows import first_not_finite

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_envs._numba import inline_kernel
+from quad_envs.compilation.decorators import inline_kernel
 
 from .protocol import N_FALLBACKS, Actions, PolicyState
 

@@ -19,7 +19,7 @@ import gymnasium
 import numpy as np
 from numba.core import event
 
-from quad_envs._numba import announce_no_more, kept_in
+from quad_envs.compilation.decorators import announce_no_more, kept_in
 from quad_envs.registration import TEAMS, TRACKING
 
 from ..policies.environments import make_env, task_of

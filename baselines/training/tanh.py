@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from quad_envs._numba import entry_of, kernel
+from quad_envs.compilation.decorators import entry_of, kernel
 
 _END = np.float32(7.90531110763549805)  # where the rational function reaches 1
 _P0, _P1, _P2, _P3, _P4, _P5, _P6 = map(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from quad_envs._numba import Int, kernel
+from quad_envs.compilation.decorators import Int, kernel
 from quad_envs.parameters import Array
 from quad_envs.rotations import wrap_angle_scalar
 from quad_envs.sensors import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from controllers.qp.linalg import copy, fill, invert_spd, matvec
-from quad_envs._numba import Int, kernel
+from quad_envs.compilation.decorators import Int, kernel
 from quad_envs.parameters import Array
 
 from .arguments import BoolArray

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from controllers.qp.linalg import cholesky, matmul, solve_lower, solve_lower_transposed, symmetrise
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.parameters import Array
 
 from .arguments import BoolArray, as_floats

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.parameters import Array
 from quad_envs.sensors import AZIMUTH, ELEVATION, RANGE
 

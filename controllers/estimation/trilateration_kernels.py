@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from controllers.qp.linalg import cholesky, copy, fill, invert_spd, solve_lower, solve_lower_transposed
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.parameters import Array
 
 from .arguments import BoolArray

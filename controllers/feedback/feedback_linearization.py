@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.dynamics import rotor_shares
 from quad_envs.parameters import (
     GRAVITY,

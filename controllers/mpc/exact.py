@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from typing import Annotated, Any, ClassVar, NamedTuple
 
-from quad_envs._numba import entry_of, kernel, threaded_kernel
-from quad_envs.packed import unpacker
+from quad_envs.compilation.decorators import entry_of, kernel, threaded_kernel
+from quad_envs.compilation.packed import unpacker
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 from quad_envs.rotations import sincos, wrap_angle_scalar
 from quad_envs.tasks import Task

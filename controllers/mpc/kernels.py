@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, NamedTuple
 
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.parameters import HOVER_FORCE, N_INPUT, N_STATE, Array
 from quad_envs.rotations import sincos
 

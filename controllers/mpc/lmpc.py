@@ -6,8 +6,8 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from quad_envs._numba import entry_of, threaded_kernel
-from quad_envs.packed import unpacker
+from quad_envs.compilation.decorators import entry_of, threaded_kernel
+from quad_envs.compilation.packed import unpacker
 from quad_envs.parameters import ATTITUDE, Array
 from quad_envs.tasks import Task
 

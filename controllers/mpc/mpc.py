@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quad_envs.compilation.packed import pack
+from quad_envs.compilation.threads import Threads
 from quad_envs.limits import Limits
-from quad_envs.packed import pack
 from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, RATES, Array
 from quad_envs.tasks import BaseTask, Task
-from quad_envs.threads import Threads
 
 from ..controller import (
     Decision,

@@ -10,7 +10,7 @@ no such terms:
 
 from __future__ import annotations
 
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.parameters import Array
 from quad_envs.rotations import sincos
 

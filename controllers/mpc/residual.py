@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.parameters import N_STATE, Array
 from quad_envs.rotations import sincos, wrap_angle_scalar
 

@@ -7,7 +7,7 @@ a bound of what the plan loses (iteratively reweighted least squares, majorise a
 
 from __future__ import annotations
 
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 
 from ..qp.linalg import copy

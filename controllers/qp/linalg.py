@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.parameters import Array
 
 

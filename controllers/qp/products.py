@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from quad_envs._numba import inline_kernel
+from quad_envs.compilation.decorators import inline_kernel
 from quad_envs.parameters import Array
 
 from .vectors import WIDTH, add_scaled, entry, load, load_part, store, store_part, transposed, zero

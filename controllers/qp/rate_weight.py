@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 
 from .linalg import copy, fill, lu_solve, matmul, take_blocks

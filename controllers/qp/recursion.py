@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from quad_envs._numba import inline_kernel, kernel
+from quad_envs.compilation.decorators import inline_kernel, kernel
 from quad_envs.parameters import N_INPUT, Array
 
 from .linalg import copy

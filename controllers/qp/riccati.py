@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.names import shown
 from quad_envs.parameters import Array
 

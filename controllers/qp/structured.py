@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.parameters import N_INPUT, Array
 
 from .active_set import (

@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.parameters import N_INPUT, Array
 
 from .active_set import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from quad_envs._numba import inline_kernel, kernel
+from quad_envs.compilation.decorators import inline_kernel, kernel
 from quad_envs.observations.team import COMM_AGE, COMM_WEIGHT, N_COMM, N_PLAN_STAGE
 from quad_envs.parameters import Array
 from quad_envs.rotations import sincos

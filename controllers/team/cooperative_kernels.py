@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from quad_envs._numba import kernel
+from quad_envs.compilation.decorators import kernel
 from quad_envs.observations.team import N_PLAN_STAGE, N_SENSED
 from quad_envs.observations.tracking import N_REFERENCE
 from quad_envs.parameters import N_STATE, Array

@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .._intrinsics import write_stage
-from .._numba import Int, inline_kernel
+from ..compilation.decorators import Int, inline_kernel
+from ..compilation.intrinsics import write_stage
 from ..lanes import COMMAND, COS_PSI, FORCES, PLANT, SIN_PSI, STEP, four, plus, twelve
 from ..plant import Array
 from ..rotations import sincos

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .._numba import kernel
+from ..compilation.decorators import kernel
 from ..parameters import Array
 from .scenes import project
 

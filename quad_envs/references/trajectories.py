@@ -13,8 +13,8 @@ from typing import ClassVar, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._numba import kernel
 from ..checks import require_whole
+from ..compilation.decorators import kernel
 from ..names import shown
 from ..observations.tracking import N_REFERENCE
 from ..parameters import Array

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from ...compilation.packed import IntArray, pack
 from ...lanes import COEFFICIENTS, DECAY, FORCE_MAX, Blocks
-from ...packed import IntArray, pack
 from ...parameters import ROTOR_RATE
 from ...plant import Array
 from ...tasks import BaseTask

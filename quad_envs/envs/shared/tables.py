@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._numba import entry_of
+from ...compilation.decorators import entry_of
 from ...disturbances import Disturbance
 from ...names import shown
 from ...observations.tracking import N_REFERENCE

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..._numba import entry_of
 from ...checks import array_bytes, require_memory
+from ...compilation.decorators import entry_of
+from ...compilation.packed import IntArray, pack
 from ...constraints import constraint_scales
 from ...formations import start_positions
 from ...graphs import in_neighbours
@@ -24,7 +25,6 @@ from ...lanes import (
 )
 from ...names import nearest_name, shown, unknown_name
 from ...observations.tracking import N_REFERENCE
-from ...packed import IntArray, pack
 from ...plant import N_STATE, Array
 from ...references import make_reference, pack_rows
 from ...sensors import sensor_rows

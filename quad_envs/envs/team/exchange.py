@@ -12,11 +12,11 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..._numba import Int, inline_kernel, kernel
+from ...compilation.decorators import Int, inline_kernel, kernel
+from ...compilation.packed import IntArray
 from ...lanes import ALIVE, HEARD, LANES, MOST_VALUES, STEP
 from ...observations.team import N_COMM, N_MEASURED, N_PLAN_STAGE, N_SENSED
 from ...observations.tracking import encode_preview, measured
-from ...packed import IntArray
 from ...plant import Array
 from ...rotations import sincos
 from ...sensors import AZIMUTH, RANGE, measure, reads

@@ -12,8 +12,9 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..._intrinsics import borrowed, take_nearer
-from ..._numba import Int, inline_kernel, kernel, lane_kernel
+from ...compilation.decorators import Int, inline_kernel, kernel, lane_kernel
+from ...compilation.intrinsics import borrowed, take_nearer
+from ...compilation.packed import IntArray, unpacker
 from ...dynamics import arrive, set_out
 from ...lanes import (
     ACTION,
@@ -43,7 +44,6 @@ from ...lanes import (
     twelve,
 )
 from ...observations.team import N_PLAN_STAGE
-from ...packed import IntArray, unpacker
 from ...plant import N_INPUT, Array
 from ..shared.task_vector import DT, HOVER, SUBSTEPS
 from ..tracking.kernel import begin_lane, command, first_unsound, substep

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from ..._numba import Int, inline_kernel, kernel, lane_kernel
+from ...compilation.decorators import Int, inline_kernel, kernel, lane_kernel
 from ...constraints import TOLERANCE
 from ...dynamics import sincos_in_lanes
 from ...lanes import (

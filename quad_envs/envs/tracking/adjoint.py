@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..._numba import kernel
 from ...adjoint import SCRATCH_ROWS, step_vjp_kernel
+from ...compilation.decorators import kernel
 from ...constraints import TOLERANCE
 from ...parameters import N_STATE, Array
 from ...reward import stage_cost_kernel

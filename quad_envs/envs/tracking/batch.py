@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..._numba import entry_of
 from ...checks import array_bytes, require_memory
+from ...compilation.decorators import entry_of
+from ...compilation.packed import IntArray, pack
+from ...compilation.threads import Threads
 from ...disturbances import Disturbance
 from ...lanes import LANES, N_PLANT, N_TRACKING, Blocks
 from ...names import shown
-from ...packed import IntArray, pack
 from ...plant import N_STATE, POSITION, Array
 from ...references import Reference, make_reference, state_on
 from ...table_row import N_TABLE
 from ...tasks import Task
-from ...threads import Threads
 from ..shared.given import given_plants
 from ..shared.packed_batch import PackedBatch
 from ..shared.tables import disturbance_rows, draw_vehicle, reference_rows, stage_times

@@ -11,8 +11,9 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..._intrinsics import borrowed
-from ..._numba import Int, fused, inline_kernel, inline_lane_kernel, kernel, lane_kernel
+from ...compilation.decorators import Int, fused, inline_kernel, inline_lane_kernel, kernel, lane_kernel
+from ...compilation.intrinsics import borrowed
+from ...compilation.packed import IntArray, unpacker
 from ...constraints import TOLERANCE, force_from_action
 from ...dynamics import arrive, calm_substep, depart, disturbed_substep, load_air, sincos_in_lanes
 from ...lanes import (
@@ -47,7 +48,6 @@ from ...lanes import (
     twelve,
 )
 from ...observations.tracking import N_OWN, encode_disturbance, encode_own, encode_preview, measured
-from ...packed import IntArray, unpacker
 from ...plant import N_INPUT, N_STATE, Array
 from ...reward import stage_cost_parts
 from ...table_row import N_TABLE

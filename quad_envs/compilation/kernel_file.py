@@ -68,7 +68,7 @@ def _missing(symbols: list[str]) -> list[str]:
 def _names_alone(descriptor: Any) -> bytes:
     """LLVM code that stands for a kernel's own, from which numba reads which functions there are.
 
-    Its own is for kernels that would call this one. They compile theirs, see `_nested`.
+    Its own is for kernels that would call this one. They compile theirs, see `nested`.
     """
     names = (
         descriptor.llvm_func_name,

@@ -25,9 +25,9 @@ import numba
 import numpy as np
 from numba.core import config, types
 
-from ._kernel_digest import digest
-from ._kernel_file import pack, unpack
-from ._portable import CPU, NEEDED, SHIPPED
+from .digest import digest
+from .kernel_file import pack, unpack
+from .portable import CPU, NEEDED, SHIPPED
 
 PACKAGES = ("quad_envs", "controllers", "baselines")
 _HEADER = hashlib.sha256().digest_size  # bytes before the kernel: its checksum
@@ -103,7 +103,7 @@ def runs_shipped() -> bool:
 def _places() -> Iterator[Path]:
     if chosen := getattr(config, "CACHE_DIR", ""):
         yield Path(chosen) / "quad-envs"
-    yield Path(__file__).parent / "__pycache__" / "kernels"
+    yield Path(__file__).parent.parent / "__pycache__" / "kernels"
     home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or "~/.cache"
     with contextlib.suppress(RuntimeError):  # there is no home directory
         yield Path(home).expanduser() / "quad-envs"

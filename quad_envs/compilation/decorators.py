@@ -1,7 +1,7 @@
 """Compilation of kernels with numba: one option set, fast cold starts, and one line when it takes time.
 
 A kernel may be called from other kernels and from Python. Only the kernel that Python calls is optimised, as
-a whole with all that it calls (`_nested`), becomes machine code and is kept on disk (`_kernel_cache`). Both
+a whole with all that it calls (`nested`), becomes machine code and is kept on disk (`cache`). Both
 rest on names that numba does not promise to keep. Where a version of numba lacks them, kernels are compiled
 in its plain way, which takes longer and gives the same results, and one warning says so.
 """
@@ -20,8 +20,8 @@ import numpy as np
 from numba.core import config, event
 
 try:
-    from ._kernel_cache import PACKAGES, KernelCache, folder
-    from ._nested import NestedKernel
+    from .cache import PACKAGES, KernelCache, folder
+    from .nested import NestedKernel
 except (ImportError, AttributeError) as error:  # a test hides the names in a process of its own
     warnings.warn(
         f"numba {numba.__version__} lacks what quad_envs uses to compile fast ({error}): kernels are "

@@ -8,7 +8,7 @@ from pathlib import Path
 
 CPU = "x86-64-v3"  # as LLVM names it: AVX2 and FMA, from Haswell and Zen on
 NEEDED = ("avx", "avx2", "bmi", "bmi2", "cx16", "f16c", "fma", "lzcnt", "movbe", "popcnt", "sse4.2")
-SHIPPED = Path(__file__).parent / "kernels"  # where `make wheel` puts them; a clone has none
+SHIPPED = Path(__file__).parent.parent / "kernels"  # where `make wheel` puts them; a clone has none
 
 
 def settings(folder: Path) -> dict[str, str] | None:

@@ -3,7 +3,7 @@
 Numba by itself emits machine code, wrappers for Python and a cache file for every kernel at every level of
 nesting, which doubles the time of the first decision of an MPC. Here a kernel that is called from another one
 hands over plain LLVM code and no more. This needs names that numba does not promise to keep; without them
-importing this module fails, and `_numba` compiles in numba's plain way.
+importing this module fails, and `decorators` compiles in numba's plain way.
 """
 
 from __future__ import annotations

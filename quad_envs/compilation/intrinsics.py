@@ -15,7 +15,7 @@ from numba.core import cgutils, config
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from .parameters import Array
+from ..plant import Array
 
 
 def _write_stage(
