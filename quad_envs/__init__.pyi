@@ -20,6 +20,7 @@ from .references import Heading as Heading
 from .references import Helix as Helix
 from .references import Lemniscate as Lemniscate
 from .references import Line as Line
+from .references import Mixture as Mixture
 from .references import OutAndBack as OutAndBack
 from .references import Racetrack as Racetrack
 from .references import RandomSmooth as RandomSmooth

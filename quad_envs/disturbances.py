@@ -197,6 +197,32 @@ class Gusts:
 
 
 @dataclass(frozen=True, slots=True)
+class VariedGusts(Gusts):
+    """Air that differs from episode to episode: calm, gusts, or gusts about a steady force and torque.
+
+    Each of the three is as likely. Gusts have a random share of `largest` times the deviations of `Gusts`,
+    the steady part lies within `largest` times these, and the correlation time is half to three times the
+    given one.
+    """
+
+    largest: float = 1.5  # of gusts and of the steady part, in deviations of `Gusts`
+
+    def __post_init__(self) -> None:
+        Gusts.__post_init__(self)
+        if not (is_number(self.largest) and self.largest >= 0.0):
+            raise ValueError(f"largest of varied gusts must be finite and >= 0, got {shown(self.largest)}")
+
+    def values(self, t: Array, rng: np.random.Generator) -> Array:
+        """Torque and force at the nodes of a new episode, (n_steps, n_nodes, 6)."""
+        kind, share, steady = rng.integers(3), self.largest * rng.random(), rng.uniform(-1.0, 1.0, 6)
+        if kind == 0:
+            return np.zeros((*t.shape, 6))
+        varied = replace(self, correlation_time=self.correlation_time * rng.uniform(0.5, 3.0))
+        gusts = share * Gusts.values(varied, t, rng)
+        return gusts + self.largest * self.size() * steady if kind == 2 else gusts
+
+
+@dataclass(frozen=True, slots=True)
 class Impulse:
     """A push: linear and angular momentum given evenly over the control period that contains `time`."""
 
@@ -243,6 +269,7 @@ DISTURBANCES: dict[str, Disturbance] = {
     "torque-pulse": TorquePulse(),
     "steady": Steady(),
     "gusts": Gusts(),
+    "varied-gusts": VariedGusts(),
     "impulse": Impulse(),
 }
 DisturbanceLike: TypeAlias = (

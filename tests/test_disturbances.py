@@ -11,6 +11,7 @@ from quad_envs.disturbances import (
     Impulse,
     Steady,
     TorquePulse,
+    VariedGusts,
     beyond_authority,
     disturbance_of,
     make_disturbance,
@@ -55,6 +56,29 @@ def test_impulse_gives_its_momentum_within_one_control_period():
     hit = np.abs(values).sum(axis=(1, 2)) > 0
     assert np.flatnonzero(hit).tolist() == [24]
     np.testing.assert_allclose(values[24, 0, 3:] * DT, [0.8, 0.0, -0.2])
+
+
+def test_varied_gusts_are_calm_gusts_or_gusts_about_a_steady_force():
+    varied = VariedGusts(force=0.5, torque=0.02, correlation_time=0.02)
+    found = np.stack([values_of(varied, seed)[:, 0] for seed in range(600)])
+    calm = ~found.any(axis=(1, 2))
+    assert calm.mean() == pytest.approx(1 / 3, abs=0.08)  # four deviations of 600 draws
+    means, deviations = np.abs(found.mean(axis=1)), found.std(axis=1)
+    steady = means[:, 3:].max(axis=1) > 0.4  # gusts average to less in 12 s, by five deviations
+    assert 0.15 < steady.mean() < 1 / 3
+    limit = 1.5 * varied.size()
+    assert (means < 1.4 * limit).all() and (deviations < 1.3 * limit).all()
+    blown = deviations[~calm]
+    assert np.median(blown[:, 3]) == pytest.approx(0.75 * 0.5, rel=0.15)  # half of 1.5 deviations
+
+
+def test_varied_gusts_follow_the_vehicle_and_refuse_a_negative_size():
+    crazyflie = {"vehicle": "crazyflie", "disturbance": "varied-gusts"}
+    small = gymnasium.make("quad/RandomTracking-v0", **crazyflie).unwrapped
+    small.reset(seed=0)
+    assert disturbance_of(VariedGusts(), small.task.params, small.task.limits).size()[3] < 0.05
+    with pytest.raises(ValueError, match="largest of varied gusts must be finite and >= 0, got -1"):
+        make_disturbance({"kind": "varied-gusts", "largest": -1.0})
 
 
 def test_steady_is_constant():

@@ -1,7 +1,9 @@
 """Reference trajectories: velocities are derivatives of positions, and bad tables are refused."""
 
 import pickle
+from dataclasses import fields
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from quad_envs.references import (
     Helix,
     Lemniscate,
     Line,
+    Mixture,
     OutAndBack,
     Racetrack,
     RandomSmooth,
@@ -29,6 +32,7 @@ ALL = [
     Line(),
     Racetrack(),
     RandomSmooth(),
+    Mixture(lines=0.0),  # lines turn at one time
 ]
 
 
@@ -68,6 +72,62 @@ def test_random_reference_starts_at_the_origin_differs_by_seed_and_repeats_by_se
     )
     assert np.array_equal(first, again) and not np.array_equal(first, other)
     np.testing.assert_allclose(first[0, :3], 0.0, atol=1e-12)
+
+
+def mixed(n=400, **weights):
+    mixture, t = Mixture(**weights), 0.05 * np.arange(226)
+    return np.stack([rows_of(mixture, t, seed) for seed in range(n)])
+
+
+def test_a_mixture_is_within_reach_of_the_vehicle():
+    rows = mixed(lines=0.0)
+    speed = np.linalg.norm(rows[..., 3:6], axis=2)
+    acceleration = np.linalg.norm(np.diff(rows[..., 3:6], axis=1), axis=2) / 0.05
+    assert 2.0 < speed.max() < 4.5
+    assert acceleration.max() < 5.0  # m/s^2; the rotors give 9.8
+    assert np.linalg.norm(rows[:, 0, :3], axis=1).max() < 4.95 + 2.0 * 3**0.5  # a spiral, displaced
+    np.testing.assert_array_equal(rows[..., 6:], np.broadcast_to([0.0, 1.0], rows[..., 6:].shape))
+
+
+def test_the_weights_of_a_mixture_are_the_shares_of_its_families():
+    found = [
+        type(Mixture(helix=3.0, smooth=0.0).drawn(np.random.default_rng(s))).__name__ for s in range(2000)
+    ]
+    shares = {name: found.count(name) / 2000 for name in set(found)}
+    assert set(shares) == {"SetPoint", "Helix", "SphericalSpiral", "OutAndBack", "Lemniscate"}
+    assert shares["Helix"] == pytest.approx(3 / 7, abs=0.045)  # four deviations of 2000 draws
+    assert shares["SetPoint"] == pytest.approx(1 / 7, abs=0.032)
+
+
+def test_a_mixture_of_one_family_and_no_offset_starts_at_the_origin_in_any_direction():
+    rows = mixed(100, offset=0.0, setpoint=0.0, spiral=0.0, lines=0.0, helix=0.0, smooth=0.0)
+    np.testing.assert_allclose(rows[:, 0, :3], 0.0, atol=1e-12)
+    angles = np.arctan2(rows[:, 0, 4], rows[:, 0, 3])
+    assert angles.min() < -2.5 and angles.max() > 2.5
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"helix": -1.0}, "the weight 'helix' of a mixture must be a number from 0 to 1e"),
+        (dict.fromkeys([one.name for one in fields(Mixture)], 0.0), "needs a family with a weight > 0"),
+        ({"offset": -1.0}, "the offset of a mixture must be a number from 0 to 1000 m, got -1"),
+        ({"hleix": 1.0}, "did you mean 'helix'"),
+    ],
+)
+def test_a_mixture_of_nothing_or_of_unknown_families_is_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        make_reference({"kind": "mixture", **given})
+
+
+def test_a_mixture_in_a_vector_is_that_of_single_environments():
+    kwargs = {"reference": {"kind": "mixture", "smooth": 0.5}}
+    many = gym.make_vec("quad/RandomTracking-v0", num_envs=5, **kwargs)
+    many.reset(seed=7)
+    for i in range(5):
+        one = gym.make("quad/RandomTracking-v0", **kwargs)
+        one.reset(seed=7 + i)
+        np.testing.assert_array_equal(one.unwrapped.reference, many.unwrapped.reference[i])
 
 
 def test_tangent_heading_points_along_the_path():

@@ -26,7 +26,8 @@ _POSITIVE = (
 _MOST = {
     **dict.fromkeys(("n_envs", "probes"), 100_000),
     **dict.fromkeys(("n_steps", "final_n_steps", "progress_steps", "train_freq"), 10_000),
-    **dict.fromkeys(("n_epochs", "substeps"), 1_000),
+    "n_epochs": 1_000,
+    "substeps": 64,
     **dict.fromkeys(("gradient_steps", "final_gradient_steps", "critic_updates", "episode_steps"), 1_000_000),
     "batch_size": 10_000_000,
     "buffer_size": 100_000_000,

@@ -1,7 +1,9 @@
 """Tracking flights as a differentiable function of the actions.
 
-The forward pass is the environments' compiled step, resets included; the backward pass is its adjoint. A
-flight that ends begins anew in the same step, and no gradient passes through that.
+The forward pass is the environments' compiled step: resets, disturbances, sensor noise and other vehicles
+included. The backward pass is its adjoint, which neglects disturbances: a force acts on velocities in body
+axes through the attitude, as the weight does, and that part of the derivative is left out. A flight that ends
+begins anew in the same step, and no gradient passes through that.
 """
 
 from __future__ import annotations
@@ -12,20 +14,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_envs.adjoint import SCRATCH_ROWS
+from quad_envs.encoding import Encoder, Encoding
 from quad_envs.envs.shared.task_vector import task_vector
 from quad_envs.envs.tracking.adjoint import action_slopes, tracking_vjp_rows
 from quad_envs.envs.tracking.batch import TrackingBatch
 from quad_envs.envs.tracking.options import TrackingOptions
 from quad_envs.envs.tracking.scores import scores_of
 from quad_envs.lanes import COEFFICIENTS, COMMAND, FORCE_MAX, N_PLANT, PLANT, STEP
+from quad_envs.names import shown
 from quad_envs.observations.features import Features, default_features, preview_stages
+from quad_envs.observations.tracking import N_OWN, N_REFERENCE
 from quad_envs.parameters import N_COEFFICIENTS
 from quad_envs.plant import N_INPUT, Array
-from quad_envs.table_row import N_REFERENCE
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float32]
-_OWN = 18
+_YAW = slice(5, 7)  # sine and cosine of it in an observation
 
 
 class Record(NamedTuple):
@@ -42,13 +46,14 @@ class Record(NamedTuple):
     slopes: Array  # (n, 4), of the commands by the actions
     rewards: Array  # (n,)
     done: Bools  # (n,), flights that began anew
+    yaw: Floats  # (n, 2), sine and cosine of it as the observation before had them
 
 
 class DifferentiableFlights:
     """n flights of a tracking task, from starts of the environment, at all times of the episode.
 
     Args:
-        options: Of the task; its reward must be the bounded one, and it must not have disturbances.
+        options: Of the task; its reward must be the bounded one.
         n: Number of flights.
         seed: Of the starts.
 
@@ -57,15 +62,14 @@ class DifferentiableFlights:
     """
 
     def __init__(self, options: TrackingOptions, n: int, seed: int) -> None:
-        if options.reward != "bounded" or options.disturbance is not None or max(options.noise_deviations()):
+        if options.reward != "bounded":
             raise ValueError(
-                "the analytic policy gradient needs reward='bounded' and neither disturbance nor sensor_noise"
+                f"the analytic policy gradient needs reward='bounded', got {shown(options.reward)}"
             )
         self.batch, self.n, self.rng = TrackingBatch(options, n), n, np.random.default_rng(seed)
         self.task = self.batch.task
         self.features: Features = default_features(self.task.layout)
-        self._stages = np.array(preview_stages(self.task.layout.preview), dtype=np.int64)
-        self._mean, self._scale = np.asarray(self.features.mean), np.asarray(self.features.scale)
+        self._encoder = Encoder(Encoding(self.features), self.task)
         self._vector = task_vector(self.task, options.substeps, options.lost_distance)
         self._scratch = np.zeros((SCRATCH_ROWS + 4, 16))
         self._out = np.empty((n, self.task.layout.size), dtype=np.float32)
@@ -79,38 +83,28 @@ class DifferentiableFlights:
 
     def observe(self) -> Floats:
         """Scaled features of all flights as they are, (n, features)."""
-        vehicles, references = self.batch.vehicles, self.batch.references
-        plants = vehicles.read(PLANT, N_PLANT)
-        p, psi = plants[:, None, :3], plants[:, 8:9]
-        steps = vehicles.read(STEP).astype(np.int64)[:, None] + self._stages
-        preview = references[self.batch.which[0][:, None], np.minimum(steps, references.shape[1] - 1)]
-        preview = preview[:, :, :N_REFERENCE]
-        preview[:, :, :3] -= p
-        commands = vehicles.read(COMMAND, N_INPUT)
-        parts = [plants[:, 3:8], np.sin(psi), np.cos(psi), plants[:, 9:], commands]
-        if self.task.layout.position:
-            parts.append(plants[:, :3])
-        parts.append(preview.reshape(self.n, -1))
-        scaled = (np.concatenate(parts, axis=1) - self._mean) / self._scale
-        return np.asarray(scaled, dtype=np.float32)
+        return self._encoder.see(self._out)
 
-    def observe_vjp(self, plants: Array, bar: Floats) -> tuple[Array, Array]:
-        """Sensitivities to the plants (n, 16) and the last commands (n, 4) from those to `observe`."""
-        full = bar / self._scale
-        out, at = np.zeros((self.n, 16)), _OWN
+    def observe_vjp(self, record: Record, bar: Floats) -> tuple[Array, Array]:
+        """Sensitivities to plants (n, 16) and last commands (n, 4) before a step, from those to `observe`."""
+        layout, full = self.task.layout, bar / np.asarray(self.features.scale)
+        out, at = np.zeros((self.n, 16)), N_OWN
         out[:, 3:8] = full[:, :5]
-        out[:, 8] = full[:, 5] * np.cos(plants[:, 8]) - full[:, 6] * np.sin(plants[:, 8])
+        out[:, 8] = full[:, 5] * record.yaw[:, 1] - full[:, 6] * record.yaw[:, 0]
         out[:, 9:16] = full[:, 7:14]
-        if self.task.layout.position:
+        if layout.position:
             out[:, :3] += full[:, at : at + 3]
-            at += 3
-        out[:, :3] -= full[:, at:].reshape(self.n, -1, 8)[:, :, :3].sum(axis=1)
+        start = layout.preview_start
+        stages = preview_stages(layout.preview)
+        preview = full[:, start : start + N_REFERENCE * len(stages)].reshape(self.n, -1, N_REFERENCE)
+        out[:, :3] -= preview[:, :, :3].sum(axis=1)
         return out, full[:, 14:18]
 
     def advance(self, actions: Floats) -> Record:
         """One step of all flights; those that end begin anew."""
         vehicles, references = self.batch.vehicles, self.batch.references
         plants, previous = vehicles.read(PLANT, N_PLANT), vehicles.read(COMMAND, N_INPUT)
+        yaw = self._out[:, _YAW].copy()
         self.batch.step(np.ascontiguousarray(actions).reshape(-1), self._out.reshape(-1), self._told)
         scores = scores_of(self._told.copy())
         slopes = np.empty((self.n, 4))
@@ -130,6 +124,7 @@ class DifferentiableFlights:
             slopes=slopes,
             rewards=scores.reward,
             done=done,
+            yaw=yaw,
         )
         if done.any():
             self._begin(np.flatnonzero(done))

@@ -9,6 +9,7 @@ vanishes where a flight is far off and where a violation exceeds its scale. Eval
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -114,7 +115,7 @@ def _window_gradient(
         slopes = hover_slopes(out.detach().numpy(), flights.task)
         out.backward(torch.from_numpy((actions * slopes).astype(np.float32)))
         assert x.grad is not None
-        own, last = flights.observe_vjp(record.plants, x.grad.numpy())
+        own, last = flights.observe_vjp(record, x.grad.numpy())
         plants, commands = plants + own, commands + last
     return float(np.mean([record.rewards for record in records]))
 
@@ -142,7 +143,7 @@ def train(
     import torch
 
     torch.manual_seed(seed)
-    flights = DifferentiableFlights(task_options, options.n_envs, seed)
+    flights = DifferentiableFlights(replace(task_options, substeps=options.substeps), options.n_envs, seed)
     actor = Actor(len(flights.features.names), options.net_arch, 4)
     if start is not None:
         actor.load(start, flights.features)

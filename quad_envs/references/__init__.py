@@ -9,6 +9,7 @@ from .arrays import ArrayTable
 from .choices import REFERENCES, ReferenceLike, is_frame, is_table, make_reference, plain_reference
 from .episodes import in_episode, length_of, mismatch, state_on
 from .functions import from_function
+from .mixture import Mixture
 from .plausible import too_fast
 from .tables import ColumnTable, CsvTable, from_csv
 from .trajectories import (
@@ -34,6 +35,7 @@ __all__ = [
     "Helix",
     "Lemniscate",
     "Line",
+    "Mixture",
     "OutAndBack",
     "Racetrack",
     "RandomSmooth",

@@ -14,6 +14,7 @@ from ..kinds import make_kind, refuse_class, without_booleans
 from ..names import shown, unknown_name
 from .arrays import ArrayTable, from_numbers
 from .functions import FunctionReference
+from .mixture import Mixture
 from .tables import ColumnTable, CsvTable
 from .trajectories import (
     Heading,
@@ -41,6 +42,7 @@ REFERENCES: dict[str, Any] = {
     "lemniscate": Lemniscate(),
     "racetrack": Racetrack(),
     "random": RandomSmooth(),
+    "mixture": Mixture(),
     "line": Line(),
     "fast-line": Line((1.5, 0.0, -0.5)),
     "slow-helix": Helix(2.0, 0.3, -0.1),
