@@ -1,14 +1,14 @@
 """The results folder: written atomically, locked while a sweep runs, and resumable.
 
-config.json        suite, versions, git revision, command
+config.json        suite, its protocol if it is one, versions, git revision, command
 cells/*.json       one finished unit (environment x policy) each
 episodes/*.npz     the first flights of each unit, or all if asked for; a team in one file, vehicles first
 report.html        the leaderboard and these flights to look at, see `baselines.report`
 results.csv        one row per environment x policy x flight (x vehicle), when all units are finished
 summary.csv        one row per environment x policy
 failures.json      policies from outside that could not be made or broke off, where, and why
-contenders.csv     one row per environment x contender, where networks are trained: all seeds are one
-networks/          folders of the networks that are trained, see training/run_folder.py
+contenders.csv     one row per table x environment x contender, where policies have seeds: all of them are one
+networks/          folders of networks, see training/run_folder.py, and of tuned controllers
 """
 
 from __future__ import annotations

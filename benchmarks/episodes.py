@@ -27,7 +27,8 @@ from baselines import make_policy, measure, run_episodes  # noqa: E402
 from baselines.evaluation.evaluate import fly_and_measure  # noqa: E402
 from baselines.evaluation.rollout import time_decisions  # noqa: E402
 from baselines.evaluation.table import format_table  # noqa: E402
-from baselines.sweeps.suite import EnvChoice, PolicyChoice, Suite  # noqa: E402
+from baselines.sweeps.choices import EnvChoice, PolicyChoice  # noqa: E402
+from baselines.sweeps.suite import Suite  # noqa: E402
 from baselines.sweeps.unit_flights import fly_unit  # noqa: E402
 from baselines.sweeps.units import suite_units  # noqa: E402
 

@@ -10,7 +10,8 @@ import pytest
 
 from baselines import evaluate, make_policy, run_benchmark
 from baselines.certify import certify
-from baselines.sweeps.suite import EnvChoice, PolicyChoice, Suite
+from baselines.sweeps.choices import EnvChoice, PolicyChoice
+from baselines.sweeps.suite import Suite
 from baselines.training.plans import make_plan
 from baselines.training.request import TrainingRequest
 from quad_envs import checks, cooperative_estimation_v0, formation_v0, target_tracking_v0

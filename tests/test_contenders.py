@@ -134,5 +134,5 @@ def test_a_mistake_in_a_suite_with_training_is_refused_before_anything_is_done(t
 
 
 def test_training_needs_a_folder():
-    with pytest.raises(ValueError, match="trains networks, which need a folder"):
+    with pytest.raises(ValueError, match="trains or tunes policies, which need a folder"):
         run_benchmark(LEARNED)

@@ -6,10 +6,10 @@ import pytest
 
 from baselines.__main__ import main
 from baselines.policies.registry import TRACKING_POLICIES
+from baselines.sweeps.choices import PolicyChoice
 from baselines.sweeps.compiling import compile_for
 from baselines.sweeps.progress import said_left, said_seconds
 from baselines.sweeps.stages import SweepProgress, price
-from baselines.sweeps.suite import PolicyChoice
 from baselines.sweeps.suite_files import load_suite
 from baselines.sweeps.sweep import Order, Sweep
 from baselines.sweeps.units import suite_units
@@ -106,7 +106,7 @@ def test_networks_that_are_trained_are_counted_with_the_time_left(tmp_path, caps
     sweep = Sweep(load_suite(suite), {}, {}, tmp_path, Order(watcher=SweepProgress()))
     sweep.go()
     said = capsys.readouterr().err.splitlines()
-    assert said[0] == "train: 2 networks"
+    assert said[0] == "train: 2 policies"
     assert re.fullmatch(r"train: 1 of 2 are there; about \d+ (s|min) left", said[1])
     assert re.fullmatch(r"train: 2 of 2 are there; took \d+ (s|min)", said[2])
     assert said[3].startswith("compile: hover; ") and len(said) == 7

@@ -180,7 +180,8 @@ def evaluate_one(options: EvaluateOptions) -> int:
     from ..policies.environments import make_env
     from ..policies.registry import make_policy, policy_name
     from ..report.benchmark import run_benchmark
-    from ..sweeps.suite import EnvChoice, PolicyChoice, Suite
+    from ..sweeps.choices import EnvChoice, PolicyChoice
+    from ..sweeps.suite import Suite
 
     env_kwargs = read_assignments("--set", options.set)
     policy_kwargs = read_assignments("--policy-set", options.policy_set)
@@ -211,8 +212,9 @@ def evaluate_one(options: EvaluateOptions) -> int:
 def benchmark_suite(options: BenchmarkOptions) -> int:
     """Fly a suite, print its tables, and leave a results folder."""
     from ..report.benchmark import fly_suite
+    from ..sweeps.budget import budget_of
+    from ..sweeps.choices import PolicyChoice
     from ..sweeps.stages import SweepProgress
-    from ..sweeps.suite import PolicyChoice
     from ..sweeps.suite_files import load_suite
     from ..sweeps.sweep import Order
 
@@ -220,13 +222,16 @@ def benchmark_suite(options: BenchmarkOptions) -> int:
     changes = {
         name: getattr(options, name) for name in ("episodes", "seed") if getattr(options, name) is not None
     }
+    suite = suite.only(options.only) if options.only else suite
     suite = replace(suite.quick() if options.quick else suite, **changes)
     suite = replace(suite, policies=(*suite.policies, *map(PolicyChoice, options.policy)))
     out = options.out or Path("runs") / f"{suite.name}-{datetime.now():%Y%m%d-%H%M%S}"
-    finished, watcher = 0, SweepProgress()
+    finished, watcher = -1, SweepProgress()
 
     def on_unit(count: int, total: int) -> None:
         nonlocal finished
+        if finished < 0 and suite.learned:  # all is checked, and nothing begun
+            say(budget_of(suite).said(options.jobs))
         finished = count
         raise_lost()
 
@@ -243,7 +248,7 @@ def benchmark_suite(options: BenchmarkOptions) -> int:
         try:
             results = fly_suite(suite, {}, out, order)
         except KeyboardInterrupt as interruption:
-            say(f"interrupted; {finished} units are stored. Resume with: {_resume(options, out)}")
+            say(f"interrupted; {max(finished, 0)} units are stored. Resume with: {_resume(options, out)}")
             return exit_code(interruption)
         finally:
             watcher.close()
@@ -265,6 +270,7 @@ def _resume(options: BenchmarkOptions, out: Path) -> str:
     words += [f"--policy {shlex.quote(name)}" for name in options.policy]
     words += [f"--engine {options.engine}"] if options.engine != "processes" else []
     words += [f"--jobs {options.jobs}"] if options.jobs != 1 else []
+    words += [f"--only {shlex.quote(name)}" for name in options.only]
     words += ["--quick"] if options.quick else []
     words += [f"--networks {shlex.quote(str(options.networks))}"] if options.networks else []
     words += ["--save-episodes"] if options.save_episodes else []

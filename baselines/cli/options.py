@@ -75,7 +75,13 @@ class BenchmarkOptions:
     engine: Annotated[str, "who runs the units: processes, ray or dask"] = "processes"
     jobs: Annotated[int, "units flown at a time"] = 1
     fresh: Annotated[bool, "discard what the folder holds of an earlier run, but for networks"] = False
-    networks: Annotated[Path | None, "where networks that the suite trains are or go; OUT/networks"] = None
+    networks: Annotated[
+        Path | None, "where networks and tuned policies that the suite makes are or go; OUT/networks"
+    ] = None
+    only: Annotated[
+        list[str],
+        "part of the suite: tracking, teams, an environment, a condition or a table; several if repeated",
+    ] = field(default_factory=list)
     quick: Annotated[bool, "a small part of the suite, to see it work"] = False
     json: Annotated[bool, "print JSON"] = False
     save_episodes: Annotated[bool, "save every flight, not only the first two of the report"] = False
@@ -239,7 +245,7 @@ def add_options(parser: argparse.ArgumentParser, kind: type[Any]) -> None:
         elif many:
             settings |= {
                 "action": "append",
-                "metavar": "NAME" if entry.name in ("policy", "tuned") else "KEY=VALUE",
+                "metavar": "NAME" if entry.name in ("policy", "tuned", "only") else "KEY=VALUE",
             }
         elif hint is not bool:
             settings["metavar"] = {int: "N", float: "S", Path: "FOLDER"}.get(settings["type"], "NAME")

@@ -41,6 +41,7 @@ class PolicyEntry(NamedTuple):
     missions: tuple[str, ...] = ("tracking",)  # that it serves, see `BaseTask.mission`
     decision_ms: float = 0.05  # about, of a vehicle: sweeps fly the quick ones first, and estimate their time
     privileged: bool = False  # it sees `env.state()`: a yardstick, listed apart
+    mpc: bool = False  # it plans with a model, and is what learned policies are asked to beat
 
 
 SAFE = "safe:"  # before the name of a policy: a safety filter stands in front of it
@@ -50,19 +51,32 @@ TEAM_MISSIONS = (_FORMATION, _TARGET, _ESTIMATION)
 # Names that `make_policy` knows for tracking tasks.
 TRACKING_POLICIES: dict[str, PolicyEntry] = {
     "lmpc": PolicyEntry(
-        "controllers", "LinearMPC", "linear MPC on the hover model (chapter 3)", decision_ms=0.06
+        "controllers",
+        "LinearMPC",
+        "linear MPC on the hover model (chapter 3)",
+        decision_ms=0.06,
+        mpc=True,
     ),
     "sdc-nmpc": PolicyEntry(
-        "controllers", "SdcNmpc", "MPC on the state-dependent model (chapter 4)", decision_ms=0.13
+        "controllers",
+        "SdcNmpc",
+        "MPC on the state-dependent model (chapter 4)",
+        decision_ms=0.13,
+        mpc=True,
     ),
     "nmpc": PolicyEntry(
-        "controllers", "ExactNmpc", "MPC on the exact model: real-time iteration, or SQP", decision_ms=0.2
+        "controllers",
+        "ExactNmpc",
+        "MPC on the exact model: real-time iteration, or SQP",
+        decision_ms=0.2,
+        mpc=True,
     ),
     "score-nmpc": PolicyEntry(
         "controllers.mpc.exact",
         "ScoreNmpc",
         "the same, planning for the score instead of the quadratic cost",
         decision_ms=0.2,
+        mpc=True,
     ),
     "sdre": PolicyEntry(
         "controllers", "Sdre", "state-dependent Riccati feedback, without preview", decision_ms=0.08
@@ -89,12 +103,14 @@ TEAM_POLICIES: dict[str, PolicyEntry] = {
         "ConsensusMpc",
         "consensus, collision avoidance and MPC of each vehicle (chapter 5)",
         (_FORMATION,),
+        mpc=True,
     ),
     "cooperative-mpc": PolicyEntry(
         "baselines.policies.cooperative",
         "make_cooperative_mpc",
         "the same beside a target that it estimates (chapter 7)",
         (_TARGET, _ESTIMATION),
+        mpc=True,
     ),
     "ekf": PolicyEntry(
         "baselines.policies.estimation",
@@ -167,6 +183,12 @@ def policy_entry(name: str, mission: str | None = None) -> PolicyEntry:
 def behind_filter(name: str) -> str:
     """The name of the policy behind a safety filter, `safe:NAME`; of any other, itself."""
     return name.removeprefix(SAFE)
+
+
+def is_mpc(name: str) -> bool:
+    """Whether a name is that of an MPC that sees what others see."""
+    entry = (TRACKING_POLICIES | TEAM_POLICIES).get(name)
+    return entry is not None and entry.mpc
 
 
 def _is_filtered(source: Any) -> bool:

@@ -17,11 +17,13 @@ from ..files import locked, write_atomic
 from ..policies.environments import make_env
 from ..policies.outside import name_of
 from ..policies.registry import behind_filter, from_outside, is_trained, make_policy, policy_entry
+from ..sweeps.choices import PolicyChoice
 from ..sweeps.comparison import Results
 from ..sweeps.engines import check_engine
-from ..sweeps.finished import training_plan
+from ..sweeps.finished import check_unit
 from ..sweeps.folder import read_run
-from ..sweeps.suite import PolicyChoice, Suite
+from ..sweeps.protocol import require_disjoint_starts
+from ..sweeps.suite import Suite
 from ..sweeps.suite_files import load_suite
 from ..sweeps.sweep import Order, Sweep, with_given
 from ..sweeps.units import Given, Unit, suite_units, training_units
@@ -86,6 +88,7 @@ def fly_suite(
     """`run_benchmark` where some policies, by their titles, are objects."""
     check_engine(order.engine)
     require_jobs(order.jobs)
+    require_disjoint_starts(suite)
     _refuse_no_folder(suite, out, order)
     failed = _refuse_bad_units(suite, given)
     folder = None if out is None else Path(out).absolute()
@@ -103,7 +106,9 @@ def _refuse_no_folder(suite: Suite, out: str | Path | None, order: Order) -> Non
     if order.save_episodes and out is None:
         raise ValueError("save_episodes needs a folder: give out")
     if training_units(suite) and out is None and order.networks is None:
-        raise ValueError(f"suite {suite.name!r} trains networks, which need a folder: give out or networks")
+        raise ValueError(
+            f"suite {suite.name!r} trains or tunes policies, which need a folder: give out or networks"
+        )
 
 
 def _refuse_bad_units(suite: Suite, given: Mapping[str, Given]) -> dict[int, str]:
@@ -113,7 +118,7 @@ def _refuse_bad_units(suite: Suite, given: Mapping[str, Given]) -> dict[int, str
         Number of each unit whose policy is from outside and cannot be made -> why.
     """
     for training in training_units(suite):
-        training_plan(training)
+        check_unit(training)
     failed = {}
     for _, group in groupby(with_given(suite_units(suite), given), key=lambda unit: unit.env.title):
         units = list(group)
@@ -121,7 +126,7 @@ def _refuse_bad_units(suite: Suite, given: Mapping[str, Given]) -> dict[int, str
         env = make_env(units[0].env.id, **units[0].env.kwargs) if own is None else own
         for unit in units:
             try:
-                if unit.policy.train is None:
+                if unit.policy.made is None:
                     _refuse_bad_policy(unit, env)
             except ValueError as error:
                 if not from_outside(unit.source):
@@ -135,7 +140,7 @@ def _refuse_bad_units(suite: Suite, given: Mapping[str, Given]) -> dict[int, str
 def _refuse_bad_policy(unit: Unit, env: Any) -> None:
     """Make a policy once."""
     try:
-        make_policy(unit.source, env, **unit.policy.kwargs)
+        make_policy(unit.source, env, **unit.options)
     except ValueError as error:
         known = from_outside(unit.source) or is_trained(unit.source)
         if known or env.unwrapped.task.mission in policy_entry(behind_filter(unit.source)).missions:

@@ -17,7 +17,8 @@ from ..policies.environments import require_own_task
 from ..policies.outside import name_of
 from ..policies.protocol import Policy
 from ..policies.registry import policy_name
-from ..sweeps.suite import EnvChoice, PolicyChoice, Suite
+from ..sweeps.choices import EnvChoice, PolicyChoice
+from ..sweeps.suite import Suite
 from ..sweeps.sweep import Order
 from ..sweeps.units import Given
 from .benchmark import fly_suite

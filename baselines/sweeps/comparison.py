@@ -13,8 +13,10 @@ from ..evaluation.evaluate import NO_SPANNING_TREE, Evaluation
 from ..evaluation.metrics import paired_difference, said_causes, totals, worst_violations
 from ..evaluation.table import Table, printed_table
 from ..files import plain_json
-from .contenders import contender_rows, contender_tables, find_contenders
-from .suite import EnvChoice, Suite
+from .choices import EnvChoice
+from .contenders import contender_rows, contender_tables, find_contenders, plans, rank_of
+from .protocol import protocol_facts
+from .suite import BEST_MPC, Suite
 from .units import Unit, suite_units
 
 _INTERVAL = Column("", "", "half width of its 95 % interval", printed="+-", name="score_minus_base_ci")
@@ -67,8 +69,12 @@ class Results:
 
     def base_of(self, env: str) -> str:
         """Title of the policy from which differences are taken: the suite's, else the first flown there."""
-        flown = [unit.policy.title for unit in self.flown() if unit.env.title == env]
-        return self.suite.base if self.suite.base in flown else flown[0]
+        flown = [unit.policy for unit in self.flown() if unit.env.title == env]
+        titles = [policy.title for policy in flown]
+        if self.suite.base == BEST_MPC:
+            mpcs = [policy.title for policy in flown if plans(policy)]
+            return min(mpcs, key=lambda title: rank_of([self.get(env, title)]), default=titles[0])
+        return self.suite.base if self.suite.base in titles else titles[0]
 
     def _summary_row(self, unit: Unit) -> dict[str, Any]:
         ours = self.get(unit.env.title, unit.policy.title)
@@ -99,9 +105,10 @@ class Results:
 
     def contender_rows(self) -> list[dict[str, Any]]:
         """One row per environment x contender, where all training seeds of an algorithm are one contender."""
-        names = {policy.title: policy.contender for policy in self.suite.policies}
+        names = {policy.title: policy.contender for policy in self.suite.policies} | {BEST_MPC: BEST_MPC}
         contenders = find_contenders(self.suite, self.flown(), self.evaluations, self.trainings)
-        return contender_rows(contenders, names[self.suite.base])
+        tables = [one.label for one in self.suite.tables] or [""]
+        return contender_rows(contenders, names[self.suite.base], tables)
 
     def to_dict(self) -> dict[str, Any]:
         """As plain numbers for JSON."""
@@ -110,6 +117,8 @@ class Results:
             "evaluations": [one.to_dict() for one in self.evaluations],
             "failures": [one._asdict() for one in self.failures],
         }
+        if self.suite.protocol:
+            found["protocol"] = protocol_facts(self.suite)
         if self.suite.learned:
             found |= {"contenders": plain_json(self.contender_rows()), "trainings": self.trainings}
         return found

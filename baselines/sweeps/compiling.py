@@ -25,8 +25,8 @@ from quad_envs.registration import TEAMS, TRACKING
 from ..policies.environments import make_env, task_of
 from ..policies.registry import TEAM_POLICIES, TRACKING_POLICIES, PolicyEntry, make_policy, serving
 from ..policies.trained import shipped_for
+from .choices import EnvChoice, PolicyChoice
 from .progress import Progress, said_seconds
-from .suite import EnvChoice, PolicyChoice
 from .unit_flights import fly_unit
 from .units import Unit
 
@@ -44,7 +44,10 @@ class Piece(NamedTuple):
 
 
 def registered(unit: Unit) -> PolicyEntry | None:
-    """The row of a unit's policy in the registry; None for networks and for policies from outside."""
+    """The row of a unit's policy in the registry; None for networks and for policies from outside.
+
+    A tuned controller has that of the controller.
+    """
     if unit.policy.train is not None or not unit.named:
         return None
     return TEAM_POLICIES.get(unit.policy.name) or TRACKING_POLICIES.get(unit.policy.name)
@@ -123,7 +126,7 @@ def _decide(unit: Unit) -> None:
     """One decision, without the environment's kernels: on an observation of zeros."""
     env = make_env(unit.env.id, **unit.env.kwargs)
     task: Any = task_of(env)
-    policy = make_policy(unit.policy_name, env, **unit.policy.kwargs)
+    policy = make_policy(unit.policy_name, env, **unit.options)
     policy.predict(np.zeros((getattr(env, "max_num_agents", 1), task.layout.size), dtype=np.float32), None)
 
 

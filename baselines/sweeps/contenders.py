@@ -1,4 +1,4 @@
-"""Learned policies beside controllers: all training seeds of an algorithm are one contender.
+"""Learned policies beside controllers: all seeds of a training, or of a tuning, are one contender.
 
 Each column stands for itself. The score alone is compared with statistics, since every flight has one; what a
 crash cuts short (costs, RMS) is a mean over flights, and empty where one crashed.
@@ -21,15 +21,17 @@ from ..evaluation.metrics import summarize, totals, worst_violations
 from ..evaluation.statistics import Comparison, Interval, compare
 from ..evaluation.table import Table, printed_table
 from ..evaluation.team_metrics import flight_values
-from ..policies.registry import behind_filter, from_outside
+from ..policies.registry import behind_filter, from_outside, is_mpc
 from ..training.algorithms import ALGORITHMS
-from .suite import PolicyChoice, Suite, is_for
+from .choices import PolicyChoice
+from .suite import BEST_MPC, Suite
 from .units import Unit, training_units
 
 ALL = "all environments"
+VIOLATING = 0.01  # share of steps up to which the score alone says which MPC is the best
 _COST = COLUMNS["quadratic_cost"].difference()
 # Columns beyond those of summaries: of the score, with intervals, and of training.
-SEEDS = Column("Seeds", "", "of the training", COUNTED, name="seeds")
+SEEDS = Column("Seeds", "", "of the training or tuning", COUNTED, name="seeds")
 SCORES = {
     column.name: column
     for column in (
@@ -48,7 +50,7 @@ TRAININGS = {
         Column(
             "Training",
             "CPU-s",
-            "CPU time of one training, mean of the seeds",
+            "CPU time of one training or tuning, mean of the seeds",
             LESS,
             "train",
             "training_cpu_s",
@@ -59,14 +61,17 @@ TRAININGS = {
 
 
 class Contender(NamedTuple):
-    """A controller, or all training seeds of a network, in one environment."""
+    """A controller, or all seeds of a network or a tuned controller, in one environment."""
 
     env: str
     condition: str
     name: str
-    kind: str  # "controller", "model-free", "imitation" or "model-based"; "outside" if it is none of ours
-    evaluations: tuple[Evaluation, ...]  # one per training seed
-    trainings: tuple[Mapping[str, Any], ...]  # of its networks, if it was trained here
+    kind: str  # "controller", "tuned", "model-free", "imitation", "model-based"; "outside": none of ours
+    mpc: bool
+    trace: str  # line of the frontier on which it is a point
+    tables: tuple[str, ...]  # in which it stands; all if empty
+    evaluations: tuple[Evaluation, ...]  # one per seed
+    trainings: tuple[Mapping[str, Any], ...]  # of its networks or tunings, if they were made here
 
     def row(self) -> dict[str, Any]:
         """Its columns, without comparisons."""
@@ -98,6 +103,10 @@ class Contender(NamedTuple):
         """(training seeds, starts), one number per flight."""
         return np.array([list(flight_values(one.records, column).values()) for one in self.evaluations])
 
+    def rank(self) -> tuple[float, ...]:
+        """See `rank_of`."""
+        return rank_of(self.evaluations)
+
     def beside(self, base: Contender, column: str = "score") -> Comparison | None:
         """This beside another in the same environment; None where a crash left no number."""
         ours, theirs = self.values(column), base.values(column)
@@ -128,56 +137,102 @@ def find_contenders(
     found = []
     for env in suite.envs:
         groups: dict[str, list[PolicyChoice]] = {}
-        for policy in suite.policies:
-            if is_for(policy.envs, env):
-                groups.setdefault(policy.contender, []).append(policy)
+        for policy in suite.policies_in(env):
+            groups.setdefault(policy.contender, []).append(policy)
         for condition, flown in suite.flown(env).items():
             for name, policies in groups.items():
                 if any((flown.title, policy.title) not in flights for policy in policies):
                     continue
                 one = tuple(flights[flown.title, policy.title] for policy in policies)
-                costs = [trained[env.title, policy.title] for policy in policies if policy.train is not None]
-                found.append(Contender(env.title, condition, name, _kind(policies[0]), one, tuple(costs)))
+                costs = [trained[env.title, policy.title] for policy in policies if policy.made is not None]
+                first = policies[0]
+                known = (_kind(first), plans(first), first.trace, first.tables)
+                found.append(Contender(env.title, condition, name, *known, one, tuple(costs)))
     return found
 
 
+def plans(policy: PolicyChoice) -> bool:
+    """Whether it is an MPC, tuned or not."""
+    return not (policy.shipped or policy.train) and is_mpc(behind_filter(policy.name))
+
+
+def rank_of(evaluations: Sequence[Evaluation]) -> tuple[float, ...]:
+    """Less is better: crashes come before violations of more than VIOLATING, these before the score."""
+    records = [record for one in evaluations for record in one.records]
+    crashed, violating, score = (
+        float(np.mean([getattr(record, name) for record in records]))
+        for name in ("crashed", "violation_share", "score")
+    )
+    return crashed, max(0.0, violating - VIOLATING), -score
+
+
 def _kind(policy: PolicyChoice) -> str:
+    if policy.tune is not None:
+        return "tuned"
     if policy.train is not None or policy.shipped:
         return ALGORITHMS[policy.name].kind
     name = behind_filter(policy.name)
     return "outside" if ":" in name or from_outside(name) else "controller"
 
 
-def contender_rows(contenders: Sequence[Contender], base: str) -> list[dict[str, Any]]:
-    """One row per contender, environment and condition, and one per contender and condition over all.
+def contender_rows(
+    contenders: Sequence[Contender], base: str, tables: Sequence[str] = ("",)
+) -> list[dict[str, Any]]:
+    """One row per table, contender, environment and condition, and one per contender over all environments.
 
     Args:
         contenders: Of one suite.
-        base: Name of the contender that the others are compared with.
+        base: Name of the contender that the others are compared with, or BEST_MPC.
+        tables: Labels of the tables, within each of which contenders are compared.
     """
-    rows = []
+    rows: list[dict[str, Any]] = []
+    for table in tables:
+        here = [one for one in contenders if table in ("", *one.tables) or not one.tables]
+        rivals = _rivals(here, base)
+        for one in here:
+            rival = rivals[one.env, one.condition]
+            row = {"table": table, **one.row(), "mpc": one.mpc, "trace": one.trace, "base": rival.name}
+            row |= _compared(one.beside(rival))
+            cost = one.beside(rival, "quadratic_cost")
+            row |= _spread(_COST.name, None if cost is None else cost.difference)
+            rows.append(row)
+        rows += [{"table": table, **row} for row in _over_all(here, rivals, base)]
+    return rows
+
+
+def _rivals(contenders: Sequence[Contender], base: str) -> dict[tuple[str, str], Contender]:
+    """With whom those of an environment and a condition are compared."""
+    groups: dict[tuple[str, str], list[Contender]] = {}
     for one in contenders:
-        row = one.row()
-        rivals = [other for other in contenders if other[:2] == one[:2]]
-        rival = next((other for other in rivals if other.name == base), rivals[0])
-        row |= {"base": rival.name} | _compared(one.beside(rival))
-        cost = one.beside(rival, "quadratic_cost")
-        row |= _spread(_COST.name, None if cost is None else cost.difference)
-        rows.append(row)
-    return rows + list(_over_all(contenders, base))
+        groups.setdefault((one.env, one.condition), []).append(one)
+    return {key: find_base(group, base) for key, group in groups.items()}
 
 
-def _over_all(contenders: Sequence[Contender], base: str) -> Iterator[dict[str, Any]]:
+def find_base(group: Sequence[Contender], base: str) -> Contender:
+    """The base among contenders in one environment and condition; the first of them where it did not fly.
+
+    The best MPC is chosen by the flights that are compared: where several are equally good, this favours MPC
+    by as much as chance makes one of them lead.
+    """
+    if base == BEST_MPC:
+        return min((one for one in group if one.mpc), key=Contender.rank, default=group[0])
+    return next((one for one in group if one.name == base), group[0])
+
+
+def _over_all(
+    contenders: Sequence[Contender], rivals: Mapping[tuple[str, str], Contender], base: str
+) -> Iterator[dict[str, Any]]:
     """Where a contender and the base flew in several environments: one comparison over all of them."""
     for condition, name in dict.fromkeys((one.condition, one.name) for one in contenders):
         of = {one.env: one for one in contenders if (one.condition, one.name) == (condition, name)}
-        rivals = {one.env: one for one in contenders if (one.condition, one.name) == (condition, base)}
-        envs = [env for env in of if env in rivals]
+        envs = [env for env in of if base in (BEST_MPC, rivals[env, condition].name)]
         if len(envs) < 2:
             continue
         found = compare(
-            [of[env].values("score") for env in envs], [rivals[env].values("score") for env in envs]
+            [of[env].values("score") for env in envs],
+            [rivals[env, condition].values("score") for env in envs],
         )
+        rows = [of[env].row() for env in envs]
         yield {
             "env": ALL,
             "condition": condition,
@@ -187,8 +242,10 @@ def _over_all(contenders: Sequence[Contender], base: str) -> Iterator[dict[str, 
             "seeds": min(len(of[env].evaluations) for env in envs),
             "score": float(np.mean([of[env].values("score").mean() for env in envs])),
             "base": base,
-            "crashed": sum(of[env].row()["crashed"] for env in envs),
-            "violation_share": float(np.mean([of[env].row()["violation_share"] for env in envs])),
+            "crashed": sum(row["crashed"] for row in rows),
+            "flights": sum(row["flights"] for row in rows),
+            "violation_share": float(np.mean([row["violation_share"] for row in rows])),
+            "decision_p50_ms": float(np.median([row["decision_p50_ms"] for row in rows])),
             **_compared(found),
         }
 
@@ -206,8 +263,10 @@ def _spread(name: str, interval: Interval | None) -> dict[str, float]:
 
 def contender_tables(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
     """One table per environment and condition; [low, high] are 95 % bootstrap intervals."""
-    keys = dict.fromkeys((row["env"], row["condition"]) for row in rows)
-    return [_table([row for row in rows if (row["env"], row["condition"]) == key]) for key in keys]
+    groups: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault((row["table"], row["env"], row["condition"]), []).append(row)
+    return [_table(group) for group in groups.values()]
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
@@ -219,5 +278,5 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
     table = printed_table(rows, [*columns, *TRAININGS.values()], rows[0]["base"], drop_empty=team)
     names = [(row["policy"], row["kind"], str(row["seeds"])) for row in rows]
     lines = [[*name, *cells] for name, cells in zip(names, table.rows, strict=True)]
-    title = ", ".join(filter(None, (rows[0]["env"], rows[0]["condition"])))
+    title = ", ".join(filter(None, (rows[0]["table"], rows[0]["env"], rows[0]["condition"])))
     return Table((title,), ["policy", "kind", "seeds", *table.header], lines)

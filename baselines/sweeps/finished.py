@@ -1,4 +1,4 @@
-"""Trainings of a benchmark: finished ones are taken as they are, interrupted ones go on, others begin."""
+"""What a benchmark trains or tunes: what is finished is taken, what was interrupted goes on, others begin."""
 
 from __future__ import annotations
 
@@ -10,7 +10,22 @@ from ..training.algorithms import resumable
 from ..training.plans import Plan, make_plan, read_start
 from ..training.request import TrainingRequest
 from ..training.runs import TrainingResult, run_training
+from ..training.tuning import TuningRequest, check_tuning, run_tuning, tuning_begun
+from .choices import Training, Tuning
 from .units import TrainingUnit
+
+
+def check_unit(unit: TrainingUnit) -> None:
+    """Check what a unit is to make.
+
+    Raises:
+        ValueError: If it cannot be trained or tuned.
+        MissingPackageError: If what the algorithm needs is not installed.
+    """
+    if isinstance(unit.made, Tuning):
+        check_tuning(_tuning(unit, unit.made))
+    else:
+        training_plan(unit)
 
 
 def training_plan(unit: TrainingUnit) -> Plan:
@@ -24,7 +39,8 @@ def training_plan(unit: TrainingUnit) -> Plan:
 
 
 def _request(unit: TrainingUnit) -> TrainingRequest:
-    said = unit.training
+    said = unit.made
+    assert isinstance(said, Training)
     return TrainingRequest(
         unit.env.id,
         unit.policy.name,
@@ -32,18 +48,36 @@ def _request(unit: TrainingUnit) -> TrainingRequest:
         seconds=said.seconds,
         steps=said.steps,
         out=unit.folder,
-        env_kwargs=unit.env.kwargs,
+        env_kwargs=unit.env_kwargs,
         hyper=said.hyper,
     )
 
 
+def _tuning(unit: TrainingUnit, said: Tuning) -> TuningRequest:
+    return TuningRequest(
+        unit.env.id,
+        unit.policy.name,
+        objective=said.objective,  # type: ignore[arg-type]  # which it checks
+        seed=said.seed,
+        seconds=said.seconds,
+        episodes=said.episodes,
+        fields=said.fields,
+        out=unit.folder,
+        env_kwargs=unit.env_kwargs,
+        options=unit.policy.kwargs,
+    )
+
+
 def train_unit(unit: TrainingUnit) -> dict[str, Any]:
-    """Train a network, unless its folder holds it already; its cost and its learning curve, as plain values.
+    """Train or tune a policy, unless its folder holds it already; its cost and its curve, as plain values.
 
     Raises:
         ResultsError: If the folder holds another training.
-        TrainingError: If training diverges.
+        TrainingError: If training diverges, or no candidate of a tuning stays in the air.
     """
+    if isinstance(unit.made, Tuning):
+        request = _tuning(unit, unit.made)
+        return run_tuning(replace(request, resume=tuning_begun(unit.folder))).to_dict()
     plan = training_plan(unit)
     found = _finished(unit, plan)
     if found is None:

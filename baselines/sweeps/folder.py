@@ -14,8 +14,10 @@ from baselines.evaluation.columns import Record
 from baselines.evaluation.evaluate import Evaluation
 from baselines.evaluation.team_metrics import by_flight
 from baselines.files import FAILURES, RESULTS_FORMAT, plain_json, read_json
+from baselines.sweeps.choices import EnvChoice
 from baselines.sweeps.comparison import Results
-from baselines.sweeps.suite import EnvChoice, Suite
+from baselines.sweeps.protocol import check_stored
+from baselines.sweeps.suite import BEST_MPC, Suite
 from baselines.sweeps.units import Unit, suite_units
 from quad_envs.constraints import TOLERANCE
 from quad_envs.limits import UNITS
@@ -58,8 +60,9 @@ class Run(NamedTuple):
 
 def _results(suite: Suite, env: EnvChoice, here: Sequence[Finished]) -> Results:
     """The table of one environment, with the policies that have been flown there."""
-    policies = tuple(replace(one.unit.policy, envs=()) for one in here)  # `envs` may name others than this
-    base = suite.base if suite.base in [policy.title for policy in policies] else ""
+    # What they name are others than this one.
+    policies = tuple(replace(one.unit.policy, envs=(), conditions=(), tables=()) for one in here)
+    base = suite.base if suite.base in (BEST_MPC, *(policy.title for policy in policies)) else ""
     part = Suite(suite.name, (env,), policies, suite.episodes, suite.seed, base)
     return Results(part, tuple(one.evaluation for one in here))
 
@@ -98,6 +101,7 @@ def read_run(folder: Path) -> Run:
         suite = Suite.from_dict(config["suite"])
     except (KeyError, TypeError, ValueError) as error:
         raise ResultsError(f"the suite in {str(folder / 'config.json')!r} is not valid: {error}") from error
+    check_stored(folder, config, suite)
     units = suite_units(suite, folder / "episodes", suite.episodes)
     finished = tuple(
         _finished(unit, folder / "cells" / unit.file_name)

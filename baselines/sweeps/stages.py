@@ -35,7 +35,7 @@ class SweepProgress:
         """So many of the networks are there; each takes about as long as another."""
         if self._train is None:
             self._train = Progress("train", total)
-            self._train.write(f"train: {total} networks")
+            self._train.write(f"train: {total} policies")
             return
         self._train.write(f"train: {finished} of {total} are there; {self._train.move(finished, total)}")
         if finished == total:

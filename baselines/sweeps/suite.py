@@ -1,109 +1,36 @@
 """Suites as values: which policies fly in which environments, under which conditions, from which starts.
 
-`suite_files` reads them from TOML, `units` cuts them into what is done in one piece.
+`suite_files` reads them from TOML, `units` cuts them into what is done in one piece. A suite with a version
+is a protocol, whose definition has a digest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from quad_envs.checks import require_whole
 from quad_envs.names import shown, unknown_name
 
 from ..evaluation.amounts import require_episodes
+from ..files import plain_json
+from .choices import (
+    FIRST_PART,
+    PARTS,
+    Condition,
+    EnvChoice,
+    Part,
+    PolicyChoice,
+    TableChoice,
+    is_for,
+    with_tuples,
+)
 
-# What --quick keeps of a suite.
-_QUICK_SEEDS, _QUICK_CONDITIONS, _QUICK_EPISODES = 2, 2, 5
-_QUICK_BUDGET, _QUICK_SECONDS = 20, 3.0  # divisor of training budgets; CPU-seconds where none is given
-
-
-@dataclass(frozen=True, slots=True)
-class EnvChoice:
-    """An environment of a suite."""
-
-    id: str
-    kwargs: dict[str, Any] = field(default_factory=dict)
-    label: str = ""  # for tables; the id and the arguments if empty
-
-    @property
-    def title(self) -> str:
-        """Label for tables."""
-        return self.label or _title(self.id, self.kwargs)
-
-
-@dataclass(frozen=True, slots=True)
-class Condition:
-    """Arguments under which environments of a suite are flown, and networks were not trained."""
-
-    label: str
-    kwargs: dict[str, Any] = field(default_factory=dict)
-    envs: tuple[str, ...] = ()  # ids or labels; all if empty
-
-    @property
-    def title(self) -> str:
-        """Label for tables."""
-        return self.label
-
-    def of(self, env: EnvChoice) -> EnvChoice:
-        """The environment under this condition."""
-        return EnvChoice(env.id, {**env.kwargs, **self.kwargs}, f"{env.title}, {self.label}")
-
-
-@dataclass(frozen=True, slots=True)
-class Training:
-    """How the network of a policy is trained, in each environment in which it flies.
-
-    Raises:
-        ValueError: If the budget or the seed is not allowed.
-    """
-
-    seed: int = 0
-    steps: int | None = None  # budget in environment steps,
-    seconds: float | None = None  # or in CPU-seconds; the algorithm's own if neither
-    hyper: dict[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        require_whole("seed of a training in a suite", self.seed, 0)
-
-    def quick(self) -> Training:
-        """A small part of the budget."""
-        if self.steps is not None:
-            return replace(self, steps=max(1, self.steps // _QUICK_BUDGET))
-        seconds = _QUICK_SECONDS if self.seconds is None else self.seconds / _QUICK_BUDGET
-        return replace(self, seconds=seconds)
-
-
-@dataclass(frozen=True, slots=True)
-class PolicyChoice:
-    """A policy of a suite."""
-
-    name: str  # of a policy; of an algorithm if it is trained or shipped
-    kwargs: dict[str, Any] = field(default_factory=dict)
-    label: str = ""
-    envs: tuple[str, ...] = ()  # ids or labels of the environments in which it flies; all if empty
-    train: Training | None = None
-    shipped: bool = False  # fly the network of this algorithm that comes with the suite
-
-    @property
-    def contender(self) -> str:
-        """What policies are compared as: all training seeds of an algorithm are one."""
-        return self.label or _title(self.name, self.kwargs) + ", shipped" * self.shipped
-
-    @property
-    def title(self) -> str:
-        """Label for tables."""
-        return self.contender if self.train is None else f"{self.contender}, seed {self.train.seed}"
-
-
-def is_for(names: tuple[str, ...], env: EnvChoice) -> bool:
-    """Whether a policy or condition that names these environments, or none, is for one."""
-    return not names or env.id in names or env.title in names
-
-
-def _title(name: str, kwargs: Mapping[str, Any]) -> str:
-    return ", ".join([name, *(f"{key}={value}" for key, value in kwargs.items())])
+BEST_MPC = "best MPC"  # `compare_with`: in each environment, condition and table the best of its MPCs
+_DIGITS = 16  # of a digest
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,43 +46,71 @@ class Suite:
     policies: tuple[PolicyChoice, ...]
     episodes: int = 20  # per environment and policy
     seed: int = 0  # flight i starts with the environment seed `seed + i`
-    compare_with: str = ""  # title of the policy from which differences are taken; the first if empty
+    compare_with: str = (
+        ""  # title of the policy from which differences are taken; the first if empty; or BEST_MPC
+    )
     conditions: tuple[
         Condition, ...
     ] = ()  # each environment is flown in each; once as it is if there are none
+    tables: tuple[TableChoice, ...] = ()  # policies are compared within each; in one if there are none
+    small: Part = FIRST_PART  # what `quick` keeps
+    protocol: str = ""  # version, if it is one that others repeat
+    definition: str = ""  # digest of the whole protocol of which this is a part
 
     def __post_init__(self) -> None:
-        for name in ("name", "compare_with"):
+        for name in ("name", "compare_with", "protocol"):
             if not isinstance(getattr(self, name), str):
                 raise ValueError(f"{name} of a suite must be text, got {shown(getattr(self, name))}")
         require_episodes(f"episodes of suite {self.name!r}", self.episodes)
         require_whole(f"seed of suite {self.name!r}", self.seed, 0)
-        for kind in ("envs", "policies", "conditions"):
-            titles = [choice.title for choice in getattr(self, kind)]
-            if not titles and kind != "conditions":
+        for kind in ("envs", "conditions", "tables"):
+            self._refuse_twice(kind, [choice.title for choice in getattr(self, kind)])
+        for kind in ("envs", "policies"):
+            if not getattr(self, kind):
                 raise ValueError(f"suite {self.name!r} has no {kind}")
-            for title in titles:
-                if titles.count(title) > 1:
-                    raise ValueError(f"suite {self.name!r} has {title!r} twice in {kind}; give them labels")
-        self._check_pairs()
-        titles = [policy.title for policy in self.policies]
-        if self.compare_with and self.compare_with not in titles:
-            raise ValueError(unknown_name(f"compare_with of suite {self.name!r}:", self.compare_with, titles))
-
-    def _check_pairs(self) -> None:
-        """Each name in `envs` is one of an environment here, and each environment is flown."""
-        known = list(dict.fromkeys(name for env in self.envs for name in (env.id, env.title)))
-        for kind, choices in (("policy", self.policies), ("condition", self.conditions)):
-            for choice in choices:
-                for name in choice.envs:
-                    if name not in known:
-                        what = f"environment of {kind} {choice.title!r} in suite {self.name!r}"
-                        raise ValueError(unknown_name(what, name, known))
         for env in self.envs:
-            if not any(is_for(policy.envs, env) for policy in self.policies):
+            self._refuse_twice("policies", [policy.title for policy in self.policies_in(env)])
+        self._check_names()
+        self._check_flown()
+        titles = [policy.title for policy in self.policies]
+        if self.compare_with and self.compare_with not in (*titles, BEST_MPC):
+            raise ValueError(
+                unknown_name(f"compare_with of suite {self.name!r}:", self.compare_with, [*titles, BEST_MPC])
+            )
+
+    def _refuse_twice(self, kind: str, titles: Sequence[str]) -> None:
+        for title in titles:
+            if titles.count(title) > 1:
+                raise ValueError(f"suite {self.name!r} has {title!r} twice in {kind}; give them labels")
+
+    def _check_names(self) -> None:
+        """Each environment, condition or table that is named is one of those here."""
+        known = {
+            "envs": list(dict.fromkeys(name for env in self.envs for name in (env.id, env.title))),
+            "conditions": [one.label for one in self.conditions],
+            "tables": [one.label for one in self.tables],
+        }
+        singular = {"envs": "environment", "conditions": "condition", "tables": "table"}
+        choices: list[tuple[str, Any]] = [(f"policy {one.title!r}", one) for one in self.policies]
+        choices += [(f"condition {one.title!r}", one) for one in self.conditions]
+        for who, choice in [*choices, ("the small part", self.small)]:
+            for kind, names in known.items():
+                for name in getattr(choice, kind, ()):
+                    if name not in names:
+                        what = f"{singular[kind]} of {who} in suite {self.name!r}"
+                        raise ValueError(unknown_name(what, name, names))
+
+    def _check_flown(self) -> None:
+        """Each environment is flown by some policy under some condition."""
+        for env in self.envs:
+            if not self.policies_in(env):
                 raise ValueError(f"suite {self.name!r} has no policy for {env.title!r}")
             if not self.flown(env):
                 raise ValueError(f"suite {self.name!r} has no condition for {env.title!r}")
+
+    def policies_in(self, env: EnvChoice) -> list[PolicyChoice]:
+        """Policies that are for an environment."""
+        return [policy for policy in self.policies if is_for(policy.envs, env)]
 
     def flown(self, env: EnvChoice) -> dict[str, EnvChoice]:
         """Label of each condition that is for an environment -> what is flown; of none "" -> itself."""
@@ -165,32 +120,111 @@ class Suite:
 
     @property
     def base(self) -> str:
-        """Title of the policy from which differences are taken."""
+        """Title of the policy from which differences are taken, or BEST_MPC."""
         return self.compare_with or self.policies[0].title
 
     @property
     def learned(self) -> bool:
-        """Whether networks are among the policies, which are compared as contenders."""
-        return any(policy.train is not None or policy.shipped for policy in self.policies)
+        """Whether policies have seeds, or stand in tables: then contenders are compared."""
+        made = any(policy.made is not None or policy.shipped for policy in self.policies)
+        return made or bool(self.tables)
+
+    @property
+    def digest(self) -> str:
+        """Of all that is said here, but for the protocol of which it is a part."""
+        said = {key: value for key, value in self.to_dict().items() if key != "definition"}
+        text = json.dumps(plain_json(said), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()[:_DIGITS]
+
+    @property
+    def whole(self) -> bool:
+        """Whether it is a whole protocol, and not a part of one or another suite."""
+        return bool(self.protocol) and self.definition == self.digest
+
+    def defined(self) -> Suite:
+        """The same as a whole: of a protocol what is later taken out of it knows its digest."""
+        return replace(self, definition=self.digest) if self.protocol else self
 
     def quick(self) -> Suite:
-        """A small part, to see it work: one environment, two conditions, two seeds, small budgets."""
-        env = self.envs[0]
-        kept, seen = [], dict[str, int]()
+        """A small part, to see it work: few environments, conditions and seeds, small budgets."""
+        small, seen = self.small, dict[str, int]()
+        envs = [env for env in self.envs if small.envs and is_for(small.envs, env)] or [self.envs[0]]
+        conditions = [one for one in self.conditions if any(is_for(one.envs, env) for env in envs)]
+        named = [one for one in conditions if one.label in small.conditions]
+        kept = []
         for policy in self.policies:
-            seen[policy.contender] = seen.get(policy.contender, 0) + 1
-            if is_for(policy.envs, env) and seen[policy.contender] <= _QUICK_SEEDS:
-                envs = tuple(name for name in policy.envs if name in (env.id, env.title))
-                train = policy.train and policy.train.quick()
-                kept.append(replace(policy, envs=envs, train=train))
-        conditions = [one for one in self.conditions if is_for(one.envs, env)][:_QUICK_CONDITIONS]
+            if not any(is_for(policy.envs, env) for env in envs):
+                continue
+            key = f"{policy.contender} {policy.envs}"
+            seen[key] = seen.get(key, 0) + 1
+            if seen[key] <= small.seeds:
+                kept.append(policy.part(small.divisor))
+        return replace(
+            self._of(envs, kept, named or conditions[:2]),
+            name=f"{self.name}-quick",
+            episodes=min(self.episodes, small.episodes),
+        )
+
+    def only(self, names: Iterable[str]) -> Suite:
+        """What is named of it: parts, environments (ids or labels), conditions and tables.
+
+        Raises:
+            ValueError: If a name is none of these, or nothing is left.
+        """
+        asked = list(names)
+        known = dict.fromkeys(env.part for env in self.envs) | dict.fromkeys(
+            [*(name for env in self.envs for name in (env.title, env.id))]
+        )
+        known |= dict.fromkeys([one.label for one in self.conditions] + [one.label for one in self.tables])
+        for name in asked:
+            if name in PARTS and name not in known:
+                raise ValueError(f"suite {self.name!r} has no part {name!r} yet; it has {', '.join(known)}")
+            if name not in known:
+                raise ValueError(unknown_name(f"part of suite {self.name!r}:", name, known))
+        envs = _those(self.envs, lambda env: bool({env.part, env.title, env.id} & set(asked)))
+        conditions = _those(self.conditions, lambda one: one.label in asked)
+        tables = _those(self.tables, lambda one: one.label in asked)
+        labels = {one.label for one in tables}
+        policies = [one for one in self.policies if not one.tables or set(one.tables) & labels]
+        part = self._of(envs, policies, conditions, tables)
+        return part if part == self else replace(part, name="-".join([self.name, *map(_slug, asked)]))
+
+    def _of(
+        self,
+        envs: Sequence[EnvChoice],
+        policies: Sequence[PolicyChoice],
+        conditions: Sequence[Condition],
+        tables: Sequence[TableChoice] | None = None,
+    ) -> Suite:
+        """These of its parts, which name nothing that is no longer there."""
+        tables = self.tables if tables is None else tables
+        places = {name for env in envs for name in (env.id, env.title)}
+        labels = {one.label for one in conditions}
+        tabled = {one.label for one in tables}
+
+        def fits(choice: Any, kind: str, names: set[str]) -> bool:
+            return not getattr(choice, kind) or bool(set(getattr(choice, kind)) & names)
+
+        def cut(choice: Any) -> Any:
+            kinds = {"envs": places, "conditions": labels, "tables": tabled}
+            found = {
+                kind: tuple(name for name in getattr(choice, kind) if name in names)
+                for kind, names in kinds.items()
+                if hasattr(choice, kind)
+            }
+            return replace(choice, **found)
+
+        kept = [cut(one) for one in policies if fits(one, "envs", places) and fits(one, "conditions", labels)]
+        flown = [cut(one) for one in conditions if fits(one, "envs", places)]
+        base = self.compare_with if self.compare_with in {BEST_MPC, *(one.title for one in kept)} else ""
         return replace(
             self,
-            name=f"{self.name}-quick",
-            envs=(env,),
+            envs=tuple(envs),
             policies=tuple(kept),
-            conditions=tuple(replace(one, envs=()) for one in conditions),
-            episodes=min(self.episodes, _QUICK_EPISODES),
+            conditions=tuple(flown),
+            tables=tuple(tables),
+            small=cut_small(self.small, places, {one.label for one in flown}),
+            compare_with=base,
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -200,13 +234,29 @@ class Suite:
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Suite:
         """What `to_dict` gave, unchecked: its policies may be folders that are no longer there."""
-        policies = (
-            PolicyChoice(
-                **{**one, "train": one["train"] and Training(**one["train"]), "envs": tuple(one["envs"])}
-            )
-            for one in plain["policies"]
-        )
-        conditions = (Condition(**{**one, "envs": tuple(one["envs"])}) for one in plain["conditions"])
-        envs = (EnvChoice(**env) for env in plain["envs"])
-        parts = {"envs": tuple(envs), "policies": tuple(policies), "conditions": tuple(conditions)}
+        parts = {
+            "envs": tuple(EnvChoice(**env) for env in plain["envs"]),
+            "policies": tuple(map(PolicyChoice.from_dict, plain["policies"])),
+            "conditions": tuple(Condition(**with_tuples(one, ("envs",))) for one in plain["conditions"]),
+            "tables": tuple(TableChoice(**one) for one in plain.get("tables", ())),
+            "small": Part(**with_tuples(plain.get("small", {}), ("envs", "conditions"))),
+        }
         return cls(**{**plain, **parts})
+
+
+def cut_small(small: Part, envs: set[str], conditions: set[str]) -> Part:
+    """The small part of a suite that has no more than these."""
+    return replace(
+        small,
+        envs=tuple(name for name in small.envs if name in envs),
+        conditions=tuple(name for name in small.conditions if name in conditions),
+    )
+
+
+def _those(choices: Sequence[Any], wanted: Callable[[Any], bool]) -> list[Any]:
+    """Those that are wanted; all if none is."""
+    return [one for one in choices if wanted(one)] or list(choices)
+
+
+def _slug(text: str) -> str:
+    return "".join(c if c.isalnum() else "-" for c in text.rsplit("/", 1)[-1]).strip("-").lower()

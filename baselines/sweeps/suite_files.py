@@ -20,12 +20,18 @@ train = {seeds = [0, 1, 2], steps = 4_000_000}
 [[policies]]
 name = "ppo"                 # the network that comes with the suite
 shipped = true
+[[policies]]
+name = "nmpc"                # a controller: its options are tuned in each environment and with each seed
+tune = {seeds = [0, 1], seconds = 60}
+train_under = {randomize = 0.2}   # of a training or a tuning, beside the arguments of the environment
 [[conditions]]               # each environment is flown in each; networks are trained without them
 label = "2.45 N"
 kwargs = {kappa = 0.3125}
 
 "all" means the tracking ids, or policies. Multi-agent ids are named, and a policy that is not for all of the
 suite's environments says for which it is: `envs = ["quad/Formation-v0"]`, ids or labels. So do conditions.
+Policies are compared within `tables` (label, about), if there are any: `tables = ["levelled"]` of a policy
+says in which it stands. `small` says what --quick keeps; `protocol` is the version that others repeat.
 """
 
 from __future__ import annotations
@@ -43,15 +49,19 @@ from quad_envs.registration import TEAMS, TRACKING
 from ..policies.registry import TEAM_POLICIES, TRACKING_POLICIES, behind_filter, from_outside
 from ..policies.trained import names_trained
 from ..training.algorithms import ALGORITHMS
-from .suite import Condition, EnvChoice, PolicyChoice, Suite, Training
+from .choices import Condition, EnvChoice, Part, PolicyChoice, TableChoice, Training, Tuning
+from .suite import Suite
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
 
-_Choice = TypeVar("_Choice", EnvChoice, PolicyChoice, Condition)
-_KEYS = {EnvChoice: "id", PolicyChoice: "name", Condition: "label"}
+_Choice = TypeVar("_Choice", EnvChoice, PolicyChoice, Condition, TableChoice)
+_KEYS = {EnvChoice: "id", PolicyChoice: "name", Condition: "label", TableChoice: "label"}
+_MADE = {"train": Training, "tune": Tuning}
+_LISTS = {"envs": "ids or labels", "conditions": "labels", "tables": "labels"}
+_TABLES = ("kwargs", "train_under")
 
 
 def suite_from_dict(data: Mapping[str, Any], name: str = "suite") -> Suite:
@@ -60,7 +70,8 @@ def suite_from_dict(data: Mapping[str, Any], name: str = "suite") -> Suite:
     Raises:
         ValueError: If a key is unknown, one that is needed is missing, or a value is not allowed.
     """
-    known = [entry.name for entry in fields(Suite)]
+    known = [entry.name for entry in fields(Suite) if entry.name != "definition"]
+    data = {key: value for key, value in data.items() if key != "definition"}  # it is found anew
     for key in data:
         if key not in (*known, "description"):
             raise ValueError(unknown_name(f"key of suite {name!r}:", key, known))
@@ -73,7 +84,21 @@ def suite_from_dict(data: Mapping[str, Any], name: str = "suite") -> Suite:
     every = list(TRACKING_POLICIES) if policies == "all" else policies
     given["policies"] = _choices(PolicyChoice, every, name)
     given["conditions"] = _choices(Condition, given.get("conditions", ()), name)
-    return Suite(**{"name": name, **given})
+    given["tables"] = _choices(TableChoice, given.get("tables", ()), name)
+    given["small"] = _small(given.get("small", {}), name)
+    return Suite(**{"name": name, **given}).defined()
+
+
+def _small(table: Any, suite: str) -> Part:
+    """What --quick keeps."""
+    known = [entry.name for entry in fields(Part)]
+    if not isinstance(table, Mapping):
+        raise ValueError(f"suite {suite!r}: small must be a table, as {{seeds = 2}}, got {shown(table)}")
+    for key in table:
+        if key not in known:
+            raise ValueError(unknown_name(f"key of small in suite {suite!r}:", key, known))
+    lists = {key: _names(value, "small", key, suite) for key, value in table.items() if key in _LISTS}
+    return Part(**{**table, **lists})
 
 
 def _choices(kind: type[_Choice], entries: Any, suite: str) -> tuple[_Choice, ...]:
@@ -90,11 +115,16 @@ def _choices(kind: type[_Choice], entries: Any, suite: str) -> tuple[_Choice, ..
                 f"suite {suite!r}: choose by name or by a table with {key!r}, got {shown(entry)}"
             )
         table = _checked({key: entry} if isinstance(entry, str) else dict(entry), kind, suite)
-        if "train" in table:
-            out.extend(kind(**{**table, "train": training}) for training in _trainings(table["train"], suite))
-        else:
-            out.append(kind(**table))
+        out.extend(kind(**{**table, **made}) for made in _seeds_of(table, suite))
     return tuple(out)
+
+
+def _seeds_of(table: Mapping[str, Any], suite: str) -> list[dict[str, Any]]:
+    """What makes a policy, once per seed; once nothing for one that is not made."""
+    made = [name for name in _MADE if name in table]
+    if len(made) > 1:
+        raise ValueError(f"suite {suite!r}: policy {table['name']!r} has train and tune: give one of them")
+    return [{name: each} for name in made for each in _made(name, table[name], suite)] or [{}]
 
 
 def _checked(table: dict[str, Any], kind: type[Any], suite: str) -> dict[str, Any]:
@@ -107,30 +137,39 @@ def _checked(table: dict[str, Any], kind: type[Any], suite: str) -> dict[str, An
         raise ValueError(f"suite {suite!r}: each table needs {key!r}, got {table}")
     if not isinstance(table[key], str):
         raise ValueError(f"suite {suite!r}: {key} must be text, got {shown(table[key])}")
-    if table.get("train", 0) is None:
-        del table["train"]
+    for name in _MADE:
+        if table.get(name, 0) is None:
+            del table[name]
     allowed = _allowed(kind, table)
     name = table[key]
     if kind is PolicyChoice and not ("train" in table or table.get("shipped")):
         name = behind_filter(name)
     if allowed is not None and name not in allowed and not _is_users(kind, name):
         raise ValueError(unknown_name(f"{key} in suite {suite!r}:", name, allowed))
-    if not isinstance(table.get("kwargs", {}), Mapping):
-        raise ValueError(
-            f"suite {suite!r}: kwargs of {table[key]!r} must be a table, as {{horizon = 15}}, "
-            f"got {table['kwargs']!r}"
-        )
-    if not isinstance(table.get("label", ""), str):
-        raise ValueError(f"suite {suite!r}: the label of {table[key]!r} must be text, got {table['label']!r}")
+    _check_kinds(table, table[key], suite)
+    for entry in _LISTS:
+        if table.get(entry):
+            table[entry] = _names(table[entry], table[key], entry, suite)
+        else:
+            table.pop(entry, None)
+    return table
+
+
+def _check_kinds(table: Mapping[str, Any], who: str, suite: str) -> None:
+    """Refuse a word for a table and the like."""
+    for entry in _TABLES:
+        if not isinstance(table.get(entry, {}), Mapping):
+            raise ValueError(
+                f"suite {suite!r}: {entry} of {who!r} must be a table, as {{horizon = 15}}, "
+                f"got {table[entry]!r}"
+            )
+    for entry in ("label", "about", "trace"):
+        if not isinstance(table.get(entry, ""), str):
+            raise ValueError(f"suite {suite!r}: the {entry} of {who!r} must be text, got {table[entry]!r}")
     if not isinstance(table.get("shipped", False), bool):
         raise ValueError(
-            f"suite {suite!r}: shipped of {table[key]!r} must be true or false, got {shown(table['shipped'])}"
+            f"suite {suite!r}: shipped of {who!r} must be true or false, got {shown(table['shipped'])}"
         )
-    if table.get("envs"):
-        table["envs"] = _names(table["envs"], table[key], suite)
-    else:
-        table.pop("envs", None)
-    return table
 
 
 def _is_users(kind: type[Any], name: Any) -> bool:
@@ -144,22 +183,25 @@ def _allowed(kind: type[Any], table: Mapping[str, Any]) -> list[str] | None:
     """Names that a choice may have; None for any."""
     if kind is EnvChoice:
         return [*TRACKING, *TEAMS]
-    if kind is Condition:
+    if kind in (Condition, TableChoice):
         return None
     if "train" in table or table.get("shipped"):
         return list(ALGORITHMS)
     return list(dict.fromkeys([*TRACKING_POLICIES, *TEAM_POLICIES]))
 
 
-def _trainings(table: Any, suite: str) -> list[Training]:
-    """One training per seed."""
-    known = [entry.name for entry in fields(Training)]
+def _made(name: str, table: Any, suite: str) -> list[Training] | list[Tuning]:
+    """One training, or one tuning, per seed."""
+    kind: Any = _MADE[name]
+    known = [*(entry.name for entry in fields(kind)), "seeds"]
     if not isinstance(table, Mapping):
-        raise ValueError(f"suite {suite!r}: train must be a table, as {{seeds = [0, 1]}}, got {shown(table)}")
-    for name in table:
-        if name not in (*known, "seeds"):
-            raise ValueError(unknown_name(f"key of train in suite {suite!r}:", name, [*known, "seeds"]))
-    given = {name: value for name, value in table.items() if name != "seeds"}
+        raise ValueError(
+            f"suite {suite!r}: {name} must be a table, as {{seeds = [0, 1]}}, got {shown(table)}"
+        )
+    for key in table:
+        if key not in known:
+            raise ValueError(unknown_name(f"key of {name} in suite {suite!r}:", key, known))
+    given = {key: value for key, value in table.items() if key != "seeds"}
     if not isinstance(given.get("hyper", {}), Mapping):
         raise ValueError(
             f"suite {suite!r}: hyper of a training must be a table, as {{n_envs = 64}}, "
@@ -167,18 +209,17 @@ def _trainings(table: Any, suite: str) -> list[Training]:
         )
     seeds = table.get("seeds", [given.pop("seed", 0)])
     if not isinstance(seeds, Sequence) or isinstance(seeds, str) or not seeds:
-        raise ValueError(
-            f"suite {suite!r}: seeds of a training must be a list, as [0, 1], got {shown(seeds)}"
-        )
-    return [Training(**{**given, "seed": seed}) for seed in seeds]
+        what = "training" if kind is Training else "tuning"
+        raise ValueError(f"suite {suite!r}: seeds of a {what} must be a list, as [0, 1], got {shown(seeds)}")
+    return [kind(**{**given, "seed": seed}) for seed in seeds]
 
 
-def _names(value: Any, who: str, suite: str) -> tuple[str, ...]:
-    """The environments of a policy or a condition."""
+def _names(value: Any, who: str, kind: str, suite: str) -> tuple[str, ...]:
+    """The environments, conditions or tables that a policy or a condition names."""
     if not isinstance(value, list | tuple) or not all(isinstance(name, str) for name in value):
         raise ValueError(
-            f"suite {suite!r}: envs of {who!r} must be a list of ids or labels, got {shown(value)}; without "
-            "it all are meant"
+            f"suite {suite!r}: {kind} of {who!r} must be a list of {_LISTS[kind]}, got {shown(value)}; "
+            "without it all are meant"
         )
     return tuple(value)
 
@@ -212,7 +253,7 @@ def load_suite(source: str | Path | Mapping[str, Any] | Suite) -> Suite:
     if str(source) not in suite_names():
         raise ValueError(unknown_name("suite", str(source), suite_names()) + "; or the path of a .toml file")
     text = resources.files(__package__).joinpath("suites", f"{source}.toml").read_text("utf-8")
-    return suite_from_dict(tomllib.loads(text), path.stem)
+    return suite_from_dict(tomllib.loads(text), str(source))
 
 
 def _read_suite(path: Path) -> Suite:

@@ -26,6 +26,7 @@ from ..policies.registry import from_outside
 from .comparison import Failure, Results
 from .engines import run_units
 from .finished import train_unit
+from .protocol import protocol_facts, refuse_other_version
 from .stages import price
 from .suite import Suite
 from .unit_flights import fly_unit, timed_unit
@@ -185,9 +186,12 @@ def _begin(
     refuse_foreign(folder)
     config = folder / "config.json"
     if not config.exists():
-        write_json(config, {"format": RESULTS_FORMAT, "suite": plain_json(suite.to_dict()), **provenance()})
+        facts = protocol_facts(suite)
+        said = {"format": RESULTS_FORMAT, "suite": plain_json(suite.to_dict())}
+        write_json(config, {**said, **({"protocol": facts} if facts else {}), **provenance()})
         return {}
     stored, asked = read_json(config), plain_json(suite.to_dict())
+    refuse_other_version(folder, stored, suite)
     if stored.get("suite") != asked:
         before = stored.get("suite") or {}
         differing = ", ".join(key for key, value in asked.items() if before.get(key) != value)
@@ -212,7 +216,7 @@ def _stored_units(
     """
     for unit in units:
         path = folder / "cells" / unit.file_name
-        if not unit.named or (unit.policy.train is None and from_outside(unit.source)):
+        if not unit.named or (unit.policy.made is None and from_outside(unit.source)):
             path.unlink(missing_ok=True)
             continue
         if path.exists() and not (all_flights and any(not file.exists() for file in unit.episode_files())):

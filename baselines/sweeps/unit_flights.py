@@ -62,7 +62,7 @@ def _made(unit: Unit) -> tuple[Any, Any]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # said once before the first unit
             env = make_env(unit.env.id, **unit.env.kwargs)
-    return env, make_policy(unit.source, env, **unit.policy.kwargs)
+    return env, make_policy(unit.source, env, **unit.options)
 
 
 def _fly(unit: Unit) -> dict[str, Any]:

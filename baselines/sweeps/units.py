@@ -1,4 +1,4 @@
-"""What a benchmark does in one piece: it trains a network, or flies a policy in an environment."""
+"""What a benchmark does in one piece: it makes a policy, by training or tuning, or flies one."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 from quad_envs.parameters import Array
 
 from ..evaluation.episode import Episode
-from .suite import EnvChoice, PolicyChoice, Suite, Training, is_for
+from .choices import EnvChoice, PolicyChoice, Training, Tuning
+from .suite import Suite
 
 
 class TrainingUnit(NamedTuple):
-    """A network to train."""
+    """A network to train, or a controller to tune."""
 
     number: int
     env: EnvChoice  # without conditions
@@ -21,10 +22,15 @@ class TrainingUnit(NamedTuple):
     folder: Path
 
     @property
-    def training(self) -> Training:
-        """Its seed, budget and hyperparameters."""
-        assert self.policy.train is not None
-        return self.policy.train
+    def made(self) -> Training | Tuning:
+        """Its seed, its budget and how."""
+        assert self.policy.made is not None
+        return self.policy.made
+
+    @property
+    def env_kwargs(self) -> dict[str, Any]:
+        """Of the environment in which it is made."""
+        return {**self.env.kwargs, **self.policy.train_under}
 
 
 class Given(NamedTuple):
@@ -61,6 +67,11 @@ class Unit(NamedTuple):
         return self.policy_name if self.given.policy is None else self.given.policy
 
     @property
+    def options(self) -> dict[str, Any]:
+        """Of the policy for `make_policy`; what was made has its own."""
+        return {} if self.policy.made is not None else self.policy.kwargs
+
+    @property
     def file_name(self) -> str:
         """Name of its file in cells/."""
         return f"{self.number:03d}-{_slug(f'{self.env.title}--{self.policy.title}')}.json"
@@ -87,7 +98,7 @@ def _trained_folder(env: EnvChoice, policy: PolicyChoice, networks: Path) -> Pat
 
 
 def training_units(suite: Suite, networks: Path = Path("networks")) -> list[TrainingUnit]:
-    """All networks that the suite trains: one for each environment in which a trained policy flies.
+    """All policies that the suite trains or tunes: one for each environment in which one of them flies.
 
     Args:
         suite: The suite.
@@ -97,7 +108,7 @@ def training_units(suite: Suite, networks: Path = Path("networks")) -> list[Trai
         (env, policy)
         for policy in suite.policies
         for env in suite.envs
-        if policy.train is not None and is_for(policy.envs, env)
+        if policy.made is not None and policy in suite.policies_in(env)
     ]
     return [TrainingUnit(i, *pair, _trained_folder(*pair, networks)) for i, pair in enumerate(pairs)]
 
@@ -114,13 +125,14 @@ def suite_units(
         suite: The suite.
         episodes: Folder in which flights are saved; None if they are not.
         flights_saved: How many of each unit, the first ones.
-        networks: Folder of the networks that the suite trains.
+        networks: Folder of what the suite trains or tunes.
     """
     units: list[Unit] = []
     for env in suite.envs:
-        policies = [policy for policy in suite.policies if is_for(policy.envs, env)]
-        for flown in suite.flown(env).values():
-            for policy in policies:
+        for condition, flown in suite.flown(env).items():
+            for policy in suite.policies_in(env):
+                if policy.conditions and condition not in policy.conditions:
+                    continue
                 name, number = _policy_name(env, policy, networks), len(units)
                 flights = suite.episodes, suite.seed, episodes, flights_saved
                 units.append(Unit(number, flown, policy, name, *flights))
@@ -131,6 +143,6 @@ def _policy_name(env: EnvChoice, policy: PolicyChoice, networks: Path) -> str:
     """Name or path of a policy for one environment."""
     from ..policies.trained import shipped_name
 
-    if policy.train is not None:
+    if policy.made is not None:
         return str(_trained_folder(env, policy, networks))
     return shipped_name(policy.name, env.id) if policy.shipped else policy.name

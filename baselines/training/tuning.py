@@ -40,11 +40,12 @@ from .watching import Watcher
 
 Objective = Literal["score", "quadratic_cost"]
 FLIGHTS = 8  # of a candidate
-_SECONDS = 60.0  # budget, CPU-seconds
+SECONDS = 60.0  # budget, CPU-seconds
 _SPREAD = 0.3  # decades, of the first generation
 _VIOLATING = 10.0  # score that a flight loses if all its steps violate: limits come before the score
 _CRASHED = 1e3  # beside any cost
-_FILES = (DESCRIPTION, "curve.csv", "last.json", "config.json")
+_LAST = "last.json"
+_FILES = (DESCRIPTION, "curve.csv", _LAST, "config.json")
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,13 +124,48 @@ def tune(request: TuningRequest) -> TuningResult:
     return run_tuning(request)
 
 
+def check_tuning(request: TuningRequest) -> Search:
+    """Check what is asked for, and write nothing.
+
+    Returns:
+        What is going to be searched.
+
+    Raises:
+        ValueError: If an argument is not allowed, or the policy has nothing to tune.
+    """
+    task = training_options(request.env_id, dict(request.env_kwargs or {})).task
+    search = make_search(request.policy, task, request.options or {}, request.fields)
+    make_policy(request.policy, task, **search.options(np.zeros(search.size)))
+    _require_a_generation(request, _cma(search, np.zeros(search.size)).population_size)
+    return search
+
+
+def _cma(search: Search, mean: Array, sigma: float = _SPREAD, seed: int = 0) -> Any:
+    """Of cmaes: a normal distribution of candidates, in decades."""
+    from cmaes import CMA
+
+    return CMA(mean=mean, sigma=sigma, bounds=search.bounds, seed=seed)
+
+
+def _require_a_generation(request: TuningRequest, candidates: int) -> None:
+    least, asked = FLIGHTS * candidates, request.episodes
+    if asked is not None and asked < least:
+        raise ValueError(
+            f"a tuning of {asked} episode{'s' * (asked != 1)} cannot compare anything: one generation of "
+            f"{candidates} candidates flies {least}; give --episodes {least} or more, or "
+            "tune fewer options (--tuned)"
+        )
+
+
+def tuning_begun(folder: Path) -> bool:
+    """Whether a folder holds a search that can go on, or has used its budget."""
+    return (folder / _LAST).exists()
+
+
 def run_tuning(request: TuningRequest) -> TuningResult:
     """Do what is asked for, see `tune`."""
-    kwargs = dict(request.env_kwargs or {})
-    training_options(request.env_id, kwargs)  # says what is wrong with an argument
-    held_out = HeldOutFlights(request.env_id, kwargs)
-    search = make_search(request.policy, held_out.task, request.options or {}, request.fields)
-    make_policy(request.policy, held_out.task, **search.options(np.zeros(search.size)))
+    search = check_tuning(request)
+    held_out = HeldOutFlights(request.env_id, dict(request.env_kwargs or {}))
     path = request.folder
     with remembered(), locked(path):
         run = _Run(request, search, held_out)
@@ -157,8 +193,6 @@ class _Run:
     """One session of a search."""
 
     def __init__(self, request: TuningRequest, search: Search, held_out: HeldOutFlights) -> None:
-        from cmaes import CMA
-
         self.request, self.search, self.held_out, self.path = request, search, held_out, request.folder
         self.about = {
             "tuning": 1,
@@ -181,8 +215,7 @@ class _Run:
             seconds, self.generation, self.episodes = last["seconds"], last["generation"], last["episodes"]
         self.clock = TrainingClock(seconds)
         seed = 1000 * request.seed + self.generation
-        self.cma = CMA(mean=mean, sigma=sigma, bounds=search.bounds, seed=seed)
-        self._require_a_generation()
+        self.cma = _cma(search, mean, sigma, seed)
         if not request.resume:
             self._begin()
         self.env: Any = gymnasium.make_vec(
@@ -197,7 +230,7 @@ class _Run:
         """Share of the budget that is used up."""
         if self.request.episodes is not None:
             return float(self.episodes + self._least() - 1) / self.request.episodes
-        return self.clock.seconds / (self.request.seconds or _SECONDS)
+        return self.clock.seconds / (self.request.seconds or SECONDS)
 
     def go(self) -> None:
         """Search until the budget is used up."""
@@ -264,7 +297,7 @@ class _Run:
                 )
                 write_tuned(self.path, tuned, {**self.about, **point._asdict(), **tuned._asdict()})
             write_csv(self.path / "curve.csv", [each._asdict() for each in self.curve])
-            write_json(self.path / "last.json", self._last())
+            write_json(self.path / _LAST, self._last())
         if self.request.watcher is not None:
             self.request.watcher.judged(point, best)
 
@@ -286,15 +319,6 @@ class _Run:
         """Episodes of a generation."""
         return FLIGHTS * int(self.cma.population_size)
 
-    def _require_a_generation(self) -> None:
-        least, asked = self._least(), self.request.episodes
-        if asked is not None and asked < least:
-            raise ValueError(
-                f"a tuning of {asked} episode{'s' * (asked != 1)} cannot compare anything: one generation of "
-                f"{self.cma.population_size} candidates flies {least}; give --episodes {least} or more, or "
-                "tune fewer options (--tuned)"
-            )
-
     def _config(self) -> dict[str, Any] | None:
         path = self.path / "config.json"
         if not path.exists():
@@ -314,7 +338,7 @@ class _Run:
             raise ResultsError(
                 f"{str(self.path)!r} holds a {foreign[0]} of something else; choose another folder"
             )
-        if found is not None and not self.request.fresh and (self.path / "last.json").exists():
+        if found is not None and not self.request.fresh and (self.path / _LAST).exists():
             raise ResultsError(
                 f"{str(self.path)!r} holds a tuning of {found['policy']} on {found['env_id']}: go on with it "
                 "(--resume), discard it (--fresh), or choose another folder"
@@ -328,7 +352,7 @@ class _Run:
         import csv
 
         found = self._config()
-        if found is None or not (self.path / "last.json").exists():
+        if found is None or not (self.path / _LAST).exists():
             raise ResultsError(
                 f"{str(self.path)!r} holds no tuning that could be resumed; leave --resume out"
             )
@@ -340,5 +364,5 @@ class _Run:
                 )
         with open(self.path / "curve.csv", newline="") as file:
             self.curve = [read_point(row) for row in csv.DictReader(file)]
-        last: dict[str, Any] = read_json(self.path / "last.json")
+        last: dict[str, Any] = read_json(self.path / _LAST)
         return last
