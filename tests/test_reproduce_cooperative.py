@@ -19,13 +19,14 @@ from baselines.reproduction.meetings import (
     smallest_gap,
     team_task,
 )
-from baselines.reproduction.results import Claim, Measured, Section
+from baselines.reproduction.results import NOT_REPRODUCED, Claim, Measured, Section
 from baselines.reproduction.scenes import Track, drawn, prior, record
 from baselines.reproduction.team_flights import TeamFlight, TeamOutcome, fly_team, fly_teams
 from controllers.team.cooperative import CooperativeMpc
 from quad_envs.formations import make_formation
 from quad_envs.graphs import has_spanning_tree, make_graph, make_graph_table
 
+OWN = {"5-centre", "6-benefit", "6-honesty", "6-azimuth", "7-sharing"}  # the text does not say them
 VERDICTS = {
     "claims-5": {
         "5-printed": "FALSE",
@@ -34,8 +35,8 @@ VERDICTS = {
         "5-tree": "HOLDS",
         "5-union": "PARTLY",
         "5-mpc": "HOLDS",
-        "5-height-triangle": "PARTLY",
-        "5-height-hexagon": "PARTLY",
+        "5-height-triangle": NOT_REPRODUCED,
+        "5-height-hexagon": NOT_REPRODUCED,
         "5-separation-printed": "FALSE",
         "5-separation": "HOLDS",
         "5-centre": "HOLDS",
@@ -45,12 +46,12 @@ VERDICTS = {
         "6-covariance": "HOLDS",
         "6-fusion": "HOLDS",
         "6-aircraft": "HOLDS",
-        "6-benefit": "FALSE",
+        "6-benefit": "HOLDS",
         "6-honesty": "HOLDS",
         "6-printed": "FALSE",
         "6-fix-covariance": "FALSE",
         "6-aircraft-printed": "FALSE",
-        "6-azimuth": "FALSE",
+        "6-azimuth": "HOLDS",
     },
     "claims-7": {"7-trust": "HOLDS", "7-contact": "HOLDS", "7-height": "HOLDS", "7-sharing": "HOLDS"},
 }
@@ -302,7 +303,7 @@ def test_the_printed_covariance_of_a_fix_is_false_whatever_the_noise():
 
 def test_an_azimuth_that_is_not_wrapped_costs_more_than_a_factor_of_ten():
     claim = azimuth_claim()
-    assert claim.verdict == "FALSE" and claim.numbers["ratio"] > 10.0
+    assert claim.verdict == "HOLDS" and claim.own and claim.numbers["ratio"] > 10.0
 
 
 def test_flat_formations_see_mirror_twins():
@@ -316,7 +317,8 @@ def test_the_verdicts_of_a_chapter_are_these(name):
     section = reproduce([name], jobs=1)[0]
     assert "prints no numbers" in section.title
     assert {claim.key: claim.verdict for claim in section.claims} == VERDICTS[name]
-    assert {claim.key for claim in section.claims if claim.prototype != claim.verdict} <= {"5-height-hexagon"}
+    assert {claim.key for claim in section.claims if claim.own} == OWN & set(VERDICTS[name])
+    assert all(claim.prototype in ("", claim.verdict) for claim in section.claims)
     json.dumps(section.to_dict(), allow_nan=False)
 
 

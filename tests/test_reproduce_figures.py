@@ -25,8 +25,8 @@ from baselines.reproduction import (
     sections,
 )
 from baselines.reproduction.figures import FIGURES, draw_plate
-from baselines.reproduction.figures.model import OWN, REDRAWN, SHOWN
-from baselines.reproduction.results import Cell, Claim, Measured, Plate, Section
+from baselines.reproduction.figures.model import DRAWN, OWN, REDRAWN
+from baselines.reproduction.results import FITTED, SHOWN, Cell, Claim, Measured, Plate, Section
 
 SKETCHES = {sketch.key: sketch for group in FIGURES.values() for sketch in group}
 EVIL = '<script>alert("x")</script>'
@@ -35,9 +35,9 @@ EVIL = '<script>alert("x")</script>'
 def test_every_figure_of_the_four_lists_can_be_drawn():
     wanted = [
         *(f"4.{i}" for i in range(1, 26)),
-        *(f"5.{i}" for i in range(6, 14)),
-        *(f"6.{i}" for i in range(2, 7)),
-        *(f"7.{i}" for i in range(4, 10)),
+        *(f"5.{i}" for i in range(1, 14)),
+        *(f"6.{i}" for i in range(1, 7)),
+        *(f"7.{i}" for i in range(1, 10)),
     ]
     assert [key for key in SKETCHES if key[0].isdigit()] == wanted
 
@@ -57,7 +57,9 @@ def test_what_was_found_beyond_has_its_eight_figures():
 
 def test_captions_say_where_the_data_comes_from():
     for key, sketch in SKETCHES.items():
-        assert sketch.whole_caption.endswith(REDRAWN if key[0].isdigit() else OWN)
+        assert sketch.whole_caption.endswith(
+            (REDRAWN if sketch.flown else DRAWN) if key[0].isdigit() else OWN
+        )
 
 
 def test_files_of_figures_sort_by_number():
@@ -130,13 +132,49 @@ def test_a_page_escapes_what_it_shows(drawn):
 @pytest.mark.parametrize("word", page.VERDICTS)
 def test_a_page_says_each_verdict_in_words(word, drawn):
     text = page.render([a_section(drawn, word=word)], drawn[0])
-    assert f'<h3>a claim</h3><span class="verdict {word.lower()}">{word}</span>' in text
+    kind = word.lower().replace(" ", "-")
+    assert f'<h3>a claim</h3><span class="verdict {kind}">{word}</span>' in text
 
 
 def test_a_verdict_on_our_own_finding_is_not_taken_for_one_on_the_text(drawn):
     plate = drawn[1]._replace(key="beyond-x", verdict="HOLDS")
     text = page.render([Section("beyond", "Beyond", [], [], (plate,))], drawn[0])
     assert "our finding HOLDS" in text and "0 HOLDS</span></dt>" in text
+
+
+def test_a_finding_of_ours_is_marked_and_not_counted(drawn):
+    section = a_section(drawn, word="HOLDS")
+    own = section._replace(claims=[section.claims[0]._replace(own=True)], plates=())
+    text = page.render([own], drawn[0])
+    assert '<span class="verdict holds">our finding HOLDS</span>' in text and "0 HOLDS</span></dt>" in text
+    assert 'class="card is-holds is-own"' in text
+
+
+def test_a_fitted_table_has_that_for_its_verdict_and_says_why(drawn):
+    text = page.render([a_section(drawn)._replace(fitted="Chosen so.")], drawn[0])
+    assert f'<span class="verdict fitted">{FITTED}</span> Chosen so.' in text
+    assert f"1 {FITTED}</span></dt>" in text and f"0 {FITTED}" in page.render([a_section(drawn)], drawn[0])
+
+
+def test_what_has_a_verdict_can_be_hidden_by_it(drawn):
+    text = page.render([a_section(drawn, word=page.NOT_REPRODUCED)], drawn[0])
+    style = re.search(r"<style>(.*)</style>", text, re.DOTALL)[1]
+    boxes = set(re.findall(r'<input type="checkbox" id="show-([a-z-]+)" checked>', text))
+    assert boxes == {"not-reproduced", "shown", "false"}  # the claim, the figure, the table
+    for word in page.VERDICTS:
+        kind = word.lower().replace(" ", "-")
+        assert f"body:has(#show-{kind}:not(:checked)) .is-{kind}" in style
+    assert all(f"is-{kind}" in text.split("</style>")[1] for kind in boxes)
+
+
+def test_rows_of_numbers_with_the_same_columns_share_a_table_with_their_heads(drawn):
+    pair = {"LMPC": 1.0, "NMPC": 2.0}
+    numbers = {"RMS": pair, "effort": pair, "share": 0.5}
+    claim = Claim("k", "a claim", "HOLDS", numbers)
+    text = page.render([Section("s", "t", [], [claim])], drawn[0])
+    assert text.count('<table class="numbers">') == 2
+    assert "<th scope='col'>LMPC</th><th scope='col'>NMPC</th></tr></thead>" in text
+    assert text.index("RMS") < text.index("effort") < text.index("<th scope='col'>value</th>")
 
 
 def test_a_page_loads_nothing_and_its_policy_allows_its_own_style_alone(drawn):

@@ -14,6 +14,7 @@ from ..files import write_atomic
 from ..report.figures import house_style
 from ..sweeps.progress import Progress, said_seconds
 from . import estimation_claims, estimation_tables, formation_claims, formation_tables, page, target_claims
+from .identification import identification
 from .regulation_claims import REGULATION_CLAIMS
 from .results import Section
 from .tables import table_4_1, table_4_2
@@ -52,6 +53,7 @@ def claims_7(jobs: int = 1) -> Section:
 SECTIONS: dict[str, Callable[[int], Section]] = {
     "table-4.1": table_4_1,
     "table-4.2": table_4_2,
+    "identification": identification,
     "claims-4": claims_4,
     "claims-5": claims_5,
     "claims-6": claims_6,
@@ -65,6 +67,7 @@ FIGURE_SECTIONS = ("figures-4", "figures-5", "figures-6", "figures-7", "beyond")
 SECONDS = {
     "table-4.1": 3.0,
     "table-4.2": 1.0,
+    "identification": 17.0,
     "claims-4": 145.0,
     "figures-4": 23.0,
     "claims-5": 43.0,

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from .flights import ORIGIN, Flight, Outcome, fly_all
-from .results import Claim, verdict
+from .results import Claim, Numbers, Value, verdict
 
 # The gains are not printed. These sets reproduce the claims, found among random ones.
 GAINS_FROM_ABOVE = {"kp": 1.76, "kd": 1.91, "ka": 36.58, "kad": 6.87}
 GAINS_FROM_BELOW = {"kp": 3.1, "kd": 2.94, "ka": 21.73, "kad": 6.36}
 WEAK_ROTORS = 0.3125  # kappa of 2.45 N
 _SIDES = {"below": 1.0, "above": -1.0}
+LATE = 0.25  # s, by which feedback linearization may settle later than LMPC and still be comparable
 
 
 def regulation_flight(
@@ -37,6 +38,10 @@ def overshoot(outcome: Outcome) -> float:
     return float(max(0.0, -along.min()))
 
 
+def _pair(ours: str, linear: str) -> dict[str, Value]:
+    return {"feedback linearization": ours, "LMPC": linear}
+
+
 def _describe(outcome: Outcome) -> str:
     if not settled(outcome):
         return "not settled"
@@ -44,19 +49,23 @@ def _describe(outcome: Outcome) -> str:
 
 
 def comparable_claim(jobs: int = 1) -> Claim:
-    """Section 4.8: from (1,1,1) and (2,2,2) comparable to LMPC, slightly faster, mild overshoot."""
+    """Section 4.8: gains tuned so that from (1,1,1) and (2,2,2) it is comparable to LMPC, slightly faster."""
     cases = [(side, d) for side in _SIDES for d in (1.0, 2.0)]
     gains = {"above": GAINS_FROM_ABOVE, "below": GAINS_FROM_BELOW}
     flights = [regulation_flight("FBL", d, side, 1.0, gains[side]) for side, d in cases]
     flights += [regulation_flight("LMPC", d, side, 1.0) for side, d in cases]
     flown = fly_all(flights, jobs)
     ours, linear = flown[: len(cases)], flown[len(cases) :]
-    numbers: dict[str, float | str] = {}
+    numbers: Numbers = {}
     agrees = []
     for (side, d), fbl, lmpc in zip(cases, ours, linear, strict=True):
-        numbers[f"from {side}, d = {d:g} (FBL; LMPC)"] = f"{_describe(fbl)}; {_describe(lmpc)}"
-        agrees.append(settled(fbl) and fbl.record.settling_time <= lmpc.record.settling_time + 0.25)
-    text = "feedback linearization is comparable to LMPC from (1,1,1) and (2,2,2), slightly faster"
+        numbers[f"from {side}, d = {d:g}"] = _pair(_describe(fbl), _describe(lmpc))
+        agrees.append(settled(fbl) and fbl.record.settling_time <= lmpc.record.settling_time + LATE)
+    text = (
+        "feedback linearization, its gains tuned for it, is comparable to LMPC from (1,1,1) and (2,2,2): it "
+        f"settles within 5 % of the start, no more than {LATE:g} s later than LMPC (the text's gains are not "
+        "printed; ours were found by search)"
+    )
     return Claim("4-fbl-comparable", text, verdict(float(np.mean(agrees))), numbers)
 
 
@@ -71,8 +80,10 @@ def saturation_claim(jobs: int = 1) -> Claim:
     flights += [regulation_flight("LMPC", 2.0, side, WEAK_ROTORS) for side, _, _ in cases]
     share = [outcome.record.saturation_share for outcome in fly_all(flights, jobs)]
     n = len(cases)
-    numbers: dict[str, float | str] = {
-        f"from {side}, {name}, d = 2 (FBL; LMPC)": f"{share[i]:.1%}; {share[n + i]:.1%}"
+    numbers: Numbers = {
+        f"from {side}, {name}, d = 2: share of commands at a limit": _pair(
+            f"{share[i]:.1%}", f"{share[n + i]:.1%}"
+        )
         for i, (side, name, _) in enumerate(cases)
     }
     more = [share[i] > 2.0 * share[n + i] + 0.01 for i in range(n)]
@@ -105,13 +116,15 @@ def _stable_counts(gains: Sequence[dict[str, float]], side: str, jobs: int) -> t
 def instability_claim(jobs: int = 1, samples: int = 475) -> Claim:
     """Section 4.8: unstable from (3,3,3) with 2.45 N rotors, where LMPC tracks."""
     gains = random_gains(np.random.default_rng(0), samples)
-    numbers: dict[str, float | str] = {}
+    numbers: Numbers = {}
     shares = []
     for side in _SIDES:
         near, whole, far = _stable_counts(gains, side, jobs)
-        numbers[f"from {side}: stable from 1 and 2; the whole claim; stable from 3"] = (
-            f"{near / samples:.0%}; {whole / samples:.0%}; {far / samples:.0%} of {samples} random gain sets"
-        )
+        numbers[f"from {side}: share of {samples} random gain sets"] = {
+            "stable from 1 and 2 m": f"{near / samples:.0%}",
+            "the whole claim": f"{whole / samples:.0%}",
+            "stable from 3 m": f"{far / samples:.0%}",
+        }
         shares.append(whole / samples)
     linear = fly_all([regulation_flight("LMPC", d, s, WEAK_ROTORS) for s in _SIDES for d in (3.0, 5.0)], jobs)
     default = fly_all([regulation_flight("FBL", 3.0, s, WEAK_ROTORS) for s in _SIDES], jobs)

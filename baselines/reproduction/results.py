@@ -4,9 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 from ..evaluation.table import format_number, format_table
+
+# Verdicts beside HOLDS, PARTLY and FALSE.
+SHOWN = "SHOWN"  # nothing is stated that could hold or fail
+FITTED = "FITTED"  # our numbers were chosen by the printed ones
+NOT_REPRODUCED = "NOT REPRODUCED"  # does not show, but what is not printed may be why
+
+Value: TypeAlias = "float | str"
+# What was measured -> its value, or column -> value where several stand side by side.
+Numbers: TypeAlias = "dict[str, Value | Mapping[str, Value]]"
 
 
 class Cell(NamedTuple):
@@ -42,9 +51,10 @@ class Claim(NamedTuple):
 
     key: str
     text: str
-    verdict: str  # HOLDS, PARTLY or FALSE, computed from the numbers
-    numbers: Mapping[str, float | str]
+    verdict: str  # HOLDS, PARTLY, FALSE or NOT REPRODUCED, computed from the numbers
+    numbers: Numbers
     prototype: str = ""  # verdict that an independent prototype led to, where there is one
+    own: bool = False  # a sentence of ours: the dissertation does not say it
 
 
 class Plate(NamedTuple):
@@ -55,9 +65,9 @@ class Plate(NamedTuple):
     printed: str  # what the source says of it
     caption: str
     verdict: str  # as of a claim; SHOWN where the source states nothing
-    numbers: Mapping[str, float | str]
+    numbers: Numbers
     claims: tuple[str, ...]  # keys of the claims that treat the same
-    files: tuple[str, ...]  # PNG and PDF, relative to the results folder
+    files: tuple[str, ...]  # PNG and PDF, or one SVG, relative to the results folder
 
 
 class Section(NamedTuple):
@@ -68,19 +78,21 @@ class Section(NamedTuple):
     cells: list[Cell] | list[Measured]
     claims: list[Claim]
     plates: tuple[Plate, ...] = ()
+    fitted: str = ""  # what was chosen so that ours meet the printed cells; "": nothing was
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {
             "name": self.name,
             "title": self.title,
+            "fitted": self.fitted,
             "cells": [_cell_to_dict(cell) for cell in self.cells],
             "claims": [_claim_to_dict(claim) for claim in self.claims],
             "figures": [{**plate._asdict(), "numbers": _finite_all(plate.numbers)} for plate in self.plates],
         }
 
     def __str__(self) -> str:
-        parts = [self.title]
+        parts = [self.title, *([f"[{FITTED}] {self.fitted}"] if self.fitted else [])]
         printed = [cell for cell in self.cells if isinstance(cell, Cell)]
         measured = [cell for cell in self.cells if isinstance(cell, Measured)]
         if printed:
@@ -113,11 +125,13 @@ def _claim_to_dict(claim: Claim) -> dict[str, Any]:
     return said
 
 
-def _finite_all(numbers: Mapping[str, float | str]) -> dict[str, float | str | None]:
+def _finite_all(numbers: Mapping[str, Any]) -> dict[str, Any]:
     return {name: _finite(value) for name, value in numbers.items()}
 
 
-def _finite(value: float | str) -> float | str | None:
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return _finite_all(value)
     return value if isinstance(value, str) or math.isfinite(value) else None
 
 
@@ -125,7 +139,8 @@ def _claim_text(claim: Claim) -> str:
     numbers = "; ".join(f"{name}: {show(value)}" for name, value in claim.numbers.items())
     differs = claim.prototype and claim.prototype != claim.verdict
     aside = f", prototype: {claim.prototype}" if differs else ""
-    return f"[{claim.verdict}{aside}] {claim.text}\n    {numbers}"
+    ours = "our finding " if claim.own else ""
+    return f"[{ours}{claim.verdict}{aside}] {claim.text}\n    {numbers}"
 
 
 def _plate_text(plate: Plate) -> str:
@@ -133,8 +148,10 @@ def _plate_text(plate: Plate) -> str:
     return f"[{plate.verdict}] {plate.key} {plate.title}: {plate.files[0]}\n    {numbers}"
 
 
-def show(value: float | str) -> str:
-    """A number of a claim as text."""
+def show(value: Value | Mapping[str, Value]) -> str:
+    """A number of a claim as text; of several each behind the name of its column."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{column}: {show(each)}" for column, each in value.items())
     return value if isinstance(value, str) else format_number(value, 3)
 
 

@@ -13,10 +13,9 @@ from quad_envs.parameters import Array
 
 from ..policies.estimate_wrapper import Fusion
 from .formation_claims import metres
-from .results import Claim, Measured, verdict
+from .results import Claim, Measured, Numbers, Value, verdict
 from .team_flights import TRACKING, TeamFlight, TeamOutcome, fly_teams
 
-Numbers = dict[str, float | str]
 SEEDS = (0, 1)
 P_F = 0.1  # m^2, of 7.2
 CLOSE = 1.0  # m: spacing of the formation
@@ -127,13 +126,23 @@ def trust_claim(jobs: int = 1) -> Claim:
     return trust_verdict(trace, tracking_error(flown))
 
 
+def of_vehicles(first: int = 1, last: int = 6) -> list[str]:
+    """Columns of vehicles, counted from 1."""
+    return [f"vehicle {i}" for i in range(first, last + 1)]
+
+
+def by_vehicle(values: list[float], first: int = 1) -> dict[str, Value]:
+    """Of consecutive vehicles, the last of them 6."""
+    return dict(zip(of_vehicles(first), [metres([value]) for value in values], strict=True))
+
+
 def trust_verdict(trace: Array, error: Array) -> Claim:
     """From tr P_t, m^2, and tracking errors, m, of vehicles of case 2."""
     share = P_F / (P_F + trace / 3.0)  # of the target in the reference
     numbers: Numbers = {
-        "tr P_t, m^2, vehicles 1 to 6": ", ".join(f"{value:.2g}" for value in trace),
-        "share of the target in the reference": metres(share.tolist()),
-        "tracking error, m": metres(error.tolist()),
+        "tr P_t, m^2": dict(zip(of_vehicles(), [f"{value:.2g}" for value in trace], strict=True)),
+        "share of the target in the reference": by_vehicle(share.tolist()),
+        "tracking error, m": by_vehicle(error.tolist()),
     }
     right = [(share[:4] > 0.9).all(), (share[4:] < 0.1).all(), (error < CLOSE).all()]
     text = "who knows the target stays with it, who does not stays with the formation, without any switch"
@@ -157,12 +166,12 @@ def contact_verdict(connected: dict[tuple[str, str], tuple[Array, Array]], alone
     numbers: Numbers = {}
     right = []
     for (target, variant), (error, estimate) in connected.items():
-        numbers[f"{target}, {variant}: tracking errors of 5 and 6, m (their estimates)"] = (
-            f"{metres(error.tolist())} ({metres(estimate.tolist())})"
-        )
+        numbers[f"{target}, {variant}: tracking error, m"] = by_vehicle(error.tolist(), 5)
+        numbers[f"{target}, {variant}: error of their estimates, m"] = by_vehicle(estimate.tolist(), 5)
         right.append(bool((error < CLOSE).all() and (estimate > 5.0 * error).all()))
     for who, error in alone.items():
-        numbers[f"turn, {who} cut off at 8 s: tracking error, m"] = metres(error.tolist())
+        cut = f"turn, {who} cut off at 8 s: tracking error, m"
+        numbers[cut] = by_vehicle(error.tolist(), 7 - len(error))
         right.append(bool((error > 5.0 * CLOSE).all()))
     text = "vehicles without contact to the target stay close if connected to one that has it"
     return Claim("7-contact", text, verdict(float(np.mean(right))), numbers, "HOLDS")
@@ -172,14 +181,13 @@ def sharing_claim(jobs: int = 1) -> Claim:
     """Our own: sharing estimates gives what sharing measurements with neighbours alone does not."""
     own, shared = (fly_case(2, "turn", variant, jobs) for variant in ("corrected", "shared estimates"))
     numbers: Numbers = {
-        "measurements of neighbours, estimates of 5 and 6, m": metres(estimate_error(own)[4:].tolist()),
-        "with intersected estimates": metres(estimate_error(shared)[4:].tolist()),
-        "measurements of neighbours, tracking of 5 and 6, m": metres(tracking_error(own)[4:].tolist()),
-        "with intersected estimates, tracking of 5 and 6, m": metres(tracking_error(shared)[4:].tolist()),
+        f"{how}: {what} error, m": by_vehicle(error(flown)[4:].tolist(), 5)
+        for what, error in (("estimate", estimate_error), ("tracking", tracking_error))
+        for how, flown in (("measurements of neighbours", own), ("with intersected estimates", shared))
     }
     right = [estimate_error(shared).max() < 0.1, tracking_error(shared).max() < 0.3]
     text = "ours: intersected estimates (6.2, fused in both branches) tell everybody where the target is"
-    return Claim("7-sharing", text, verdict(float(np.mean(right))), numbers, "HOLDS")
+    return Claim("7-sharing", text, verdict(float(np.mean(right))), numbers, "HOLDS", own=True)
 
 
 def height_estimate_claim(jobs: int = 1, runs: int = 4000) -> Claim:
@@ -196,9 +204,10 @@ def height_estimate_claim(jobs: int = 1, runs: int = 4000) -> Claim:
         fix = trilaterate(np.tile(square, (runs, 1, 1)), z, sigma, start=start, max_ratio=np.inf)
         mirrored[h] = float((fix.r[:, 2] > 0.0).mean())
         rms = float(np.sqrt(((fix.r[:, 2] - target[2]) ** 2).mean()))
-        numbers[f"fourth of a square raised by {h:g} m: z error, m (share of mirror twins)"] = (
-            f"{rms:.3f} ({mirrored[h]:.1%})"
-        )
+        numbers[f"fourth of a square raised by {h:g} m"] = {
+            "z error, m": f"{rms:.3f}",
+            "share of mirror twins": f"{mirrored[h]:.1%}",
+        }
     slots = np.array(CHAPTER_7_SLOTS)
     spread = np.linalg.svd(slots - slots.mean(axis=0), compute_uv=False)
     numbers["formation of chapter 7: spread ratio (above 8 is nearly flat)"] = float(spread[0] / spread[2])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ...files import write_atomic
 from ...report.figures import house_style, save_figure
 from ..results import Plate, Section
 from . import (
@@ -12,7 +13,9 @@ from . import (
     beyond_tuning,
     estimation,
     formation,
+    graphs,
     regulation,
+    schemes,
     target,
     tracking,
 )
@@ -22,9 +25,9 @@ __all__ = ["FIGURES", "Drawing", "Sketch", "draw_section"]
 
 FIGURES: dict[str, tuple[Sketch, ...]] = {
     "figures-4": (*tracking.SKETCHES, *regulation.SKETCHES),
-    "figures-5": tuple(formation.SKETCHES),
-    "figures-6": tuple(estimation.SKETCHES),
-    "figures-7": tuple(target.SKETCHES),
+    "figures-5": (*graphs.FORMATIONS, *formation.SKETCHES),
+    "figures-6": (*graphs.SCENES, *estimation.SKETCHES),
+    "figures-7": (*schemes.SCHEMES, *graphs.BESIDE, *target.SKETCHES),
     "beyond": (*beyond_tracking.SKETCHES, *beyond_tuning.SKETCHES, *beyond_teams.SKETCHES),
 }
 _TITLES = {
@@ -34,7 +37,7 @@ _TITLES = {
 
 
 def draw_section(name: str, out: Path, jobs: int = 1) -> Section:
-    """Draw the figures of a section, each written as soon as it is drawn, as OUT/figures/NAME.png and .pdf.
+    """Draw the figures of a section, each saved once it is drawn: OUT/figures/NAME.png and .pdf, or .svg.
 
     Raises:
         MissingPackageError: If matplotlib is not installed.
@@ -47,10 +50,6 @@ def draw_section(name: str, out: Path, jobs: int = 1) -> Section:
 def draw_plate(sketch: Sketch, out: Path, jobs: int = 1) -> Plate:
     """Draw and save one figure."""
     drawing = sketch.draw(jobs)
-    head = sketch.title if sketch.own else f"Figure {sketch.key}, redrawn: {sketch.title}"
-    with house_style():
-        drawing.figure.suptitle(head, x=0.01, ha="left", fontsize=9.0, fontweight="bold")
-        files = save_figure(drawing.figure, out / "figures", sketch.name)
     return Plate(
         sketch.key,
         sketch.title,
@@ -59,5 +58,15 @@ def draw_plate(sketch: Sketch, out: Path, jobs: int = 1) -> Plate:
         drawing.verdict,
         drawing.numbers,
         sketch.claims,
-        tuple(file.relative_to(out).as_posix() for file in files),
+        tuple(file.relative_to(out).as_posix() for file in _saved(sketch, drawing, out / "figures")),
     )
+
+
+def _saved(sketch: Sketch, drawing: Drawing, folder: Path) -> list[Path]:
+    if isinstance(drawing.figure, str):
+        write_atomic(folder / f"{sketch.name}.svg", drawing.figure.encode())
+        return [folder / f"{sketch.name}.svg"]
+    head = sketch.title if sketch.own else f"Figure {sketch.key}, redrawn: {sketch.title}"
+    with house_style():
+        drawing.figure.suptitle(head, x=0.01, ha="left", fontsize=9.0, fontweight="bold")
+        return list(save_figure(drawing.figure, folder, sketch.name))

@@ -11,6 +11,7 @@ from quad_envs.parameters import Array
 from ...report.figures import COLOURS, house_style, new_figure
 from ..formation_claims import RULES, SEPARATION, formation
 from ..meetings import meet
+from ..results import Numbers
 from ..team_flights import FROZEN, NO_ROWS, fly_teams
 from .drawing import BETTER, LINEAR, NONLINEAR, grouped_bars, legend_below
 from .model import Drawing, Sketch, judge
@@ -50,8 +51,8 @@ def message_figure(jobs: int = 1) -> Drawing:
     axes[0, 1].set_title("weak graph: largest error, m")
     axes[0, 1].set_xlabel("time, s")
     legend_below(figure, axes[0, 1], 3)
-    numbers: dict[str, float | str] = {
-        f"{name}: error, m (weak, strong, complete)": ", ".join(f"{value:.4f}" for value in row)
+    numbers: Numbers = {
+        f"{name}: error, m": dict(zip(_GRAPHS, [f"{value:.4f}" for value in row], strict=True))
         for name, row in table.items()
     }
     frozen, ours = table["neighbours frozen"], table["constant velocity"]
@@ -79,9 +80,11 @@ def frozen_figure(jobs: int = 1) -> Drawing:
     axis.set_xlabel("speed of each vehicle, m/s")
     axis.set_title("smallest distance of two vehicles that exchange places, m (dots: runs)")
     legend_below(figure, axis, 3)
-    where = "smallest distance, m, at 0.25, 0.5, 1, 1.5, 2 m/s"
-    numbers: dict[str, float | str] = {
-        f"{label}: {where}": ", ".join(f"{value:.3f}" for value in gaps[rule].min(axis=1))
+    numbers: Numbers = {
+        f"{label}: smallest distance, m": {
+            f"at {speed:g} m/s": f"{gap:.3f}"
+            for speed, gap in zip(_SPEEDS, gaps[rule].min(axis=1), strict=True)
+        }
         for rule, (label, _) in _SHOWN.items()
     }
     kept = SEPARATION - _ROUNDING

@@ -12,6 +12,7 @@ from quad_envs.references import Helix, Reference
 
 from ...report.figures import COLOURS, house_style, new_figure
 from ..flights import CLIMBING, DESCENDING, ORIGIN, Flight, Outcome, fly_all
+from ..results import Numbers
 from .drawing import (
     BETTER,
     LINEAR,
@@ -50,7 +51,7 @@ def _percent(value: float) -> str:
 def alpha_figure(jobs: int = 1) -> Drawing:
     """Excess cost of SDC-NMPC over exact NMPC against alpha, descending and climbing."""
     figure, axes = new_figure(1, 2, height=1.1, sharey=True)
-    numbers: dict[str, float | str] = {}
+    numbers: Numbers = {}
     right = []
     for axis, (name, tasks) in zip(
         axes[0], {"descending": DESCENDING, "climbing": CLIMBING}.items(), strict=True
@@ -62,9 +63,10 @@ def alpha_figure(jobs: int = 1) -> Drawing:
             axis.semilogy(_ALPHAS, 100.0 * excess, "o-", color=colour, label=task, ms=3.5)
             for a in np.array(_ALPHAS)[np.isnan(excess)]:
                 axis.plot(a, _TOP, "x", color=colour, ms=7, mew=1.8)
-            numbers[f"{name} {task}: excess at alpha = 1/2; 1"] = (
-                f"{_percent(excess[2])}; {_percent(excess[4])}"
-            )
+            numbers[f"{name} {task}: excess"] = {
+                "alpha = 1/2": _percent(excess[2]),
+                "alpha = 1": _percent(excess[4]),
+            }
             right.append(bool(excess[4] < excess[2] or np.isnan(excess[2])))
         axis.set_title(f"{name}: cost over exact NMPC, %")
         axis.set_xlabel("alpha (crosses at the top: vehicle lost)")
@@ -97,16 +99,16 @@ def pass_figure(jobs: int = 1) -> Drawing:
     axes[0, 0].set_title("cost over exact NMPC, % (cut at 40)")
     axes[0, 0].tick_params(axis="x", labelsize=7)
     legend_below(figure, axes[0, 0], 3)
-    numbers: dict[str, float | str] = {
-        f"{label}: smallest to largest excess": _range(values) for label, values in excess.items()
+    numbers: Numbers = {
+        label: {
+            "smallest excess": f"{np.nanmin(values):+.1f} %",
+            "largest": f"{np.nanmax(values):+.1f} %",
+            "lost": f"{np.isnan(values).sum()} of {len(values)}",
+        }
+        for label, values in excess.items()
     }
     near = excess[_PASSES["1 pass"]]
     return Drawing(figure, judge(*(bool(value < 5.0) for value in near)), numbers)
-
-
-def _range(values: Array) -> str:
-    lost = int(np.isnan(values).sum())
-    return f"{np.nanmin(values):+.1f} % to {np.nanmax(values):+.1f} %" + (f", {lost} lost" if lost else "")
 
 
 @cache
@@ -141,7 +143,7 @@ def descent_figure(jobs: int = 1) -> Drawing:
         axis.set_ylim(bottom=0.0)
     legend_below(figure, axes[0, 0], 3)
     ratio = found["SDC 1/2", "effort"] / found["LMPC", "effort"]
-    numbers: dict[str, float | str] = {
+    numbers: Numbers = {
         f"vertical speed {vz:+g} m/s: effort of NMPC / of LMPC": float(ratio[i])
         for i, vz in enumerate(_SPEEDS)
         if vz in (-3.0, -2.0, 2.0, 3.0)
@@ -161,7 +163,7 @@ def climb_figure(jobs: int = 1) -> Drawing:
     figure, axes = new_figure(1, 3, height=1.2, width=7.2, gridspec_kw={"width_ratios": [1.4, 1.0, 1.0]})
     space = in_space(figure, axes[0, 0])
     space.plot(*raised(rows[:, :3]), **REFERENCE, label="reference")
-    numbers: dict[str, float | str] = {}
+    numbers: Numbers = {}
     for outcome, label, colour in zip(flown, names.values(), (NONLINEAR, LINEAR, BETTER), strict=True):
         t = times(len(outcome.error))
         near = outcome.error < 15.0
@@ -172,7 +174,7 @@ def climb_figure(jobs: int = 1) -> Drawing:
         axes[0, 2].plot(t, tilt, color=colour)
         rms = f"{outcome.record.position_rms:.2f}"
         rms = f"lost after {DT * outcome.record.steps:.1f} s" if outcome.record.crashed else rms
-        numbers[f"{label}: RMS, m; largest tilt, deg"] = f"{rms}; {tilt.max():.0f}"
+        numbers[label] = {"RMS, m": rms, "largest tilt, deg": f"{tilt.max():.0f}"}
     axes[0, 1].set_title("error, m")
     axes[0, 2].set_title("tilt, deg")
     for axis in axes[0, 1:]:

@@ -13,6 +13,7 @@ from ...report.figures import COLOURS, house_style, new_figure
 from ..flights import DESCENDING, fly_all
 from ..meetings import fly_led, team_task
 from ..regulation_claims import WEAK_ROTORS, random_gains, regulation_flight, settled
+from ..results import Numbers
 from .drawing import LINEAR, NONLINEAR, legend_below, times
 from .model import Drawing, Sketch, judge
 
@@ -30,7 +31,7 @@ def gain_figure(jobs: int = 1) -> Drawing:
     gains = random_gains(np.random.default_rng(0), _SAMPLES)
     kp, ka = (np.array([one[name] for one in gains]) for name in ("kp", "ka"))
     figure, axes = new_figure(1, 2, height=1.2, sharey=True)
-    numbers: dict[str, float | str] = {}
+    numbers: Numbers = {}
     shares = []
     for axis, d in zip(axes[0], (2.0, 3.0), strict=True):
         flights = [regulation_flight("FBL", d, "above", WEAK_ROTORS, one) for one in gains]
@@ -90,10 +91,12 @@ def horizon_figure(jobs: int = 1) -> Drawing:
         axis.set_xlabel("horizon N, samples of 0.05 s")
         axis.set_ylim(bottom=0.0)
     legend_below(figure, axes[0, 0], 2)
-    numbers: dict[str, float | str] = {
-        f"{label.replace('$', '')}: largest / smallest RMS, helix N >= 10, N >= 3; lines the same": ", ".join(
-            f"{value:.2f}" if np.isfinite(value) else "lost" for value in spread[weight]
-        )
+    columns = [f"{task}, N >= {least}" for task in ("helix", "lines") for least in (10, 3)]
+    numbers: Numbers = {
+        f"{label.replace('$', '')}: largest / smallest RMS": {
+            column: f"{value:.2f}" if np.isfinite(value) else "lost"
+            for column, value in zip(columns, spread[weight], strict=True)
+        }
         for weight, (label, _) in _WEIGHTS.items()
     }
     return Drawing(

@@ -12,12 +12,14 @@ from controllers.estimation.trilateration import trilaterate
 from quad_envs.parameters import Array
 
 from ...report.figures import COLOURS, house_style, new_figure
+from ..estimation_claims import by_interval
 from ..estimation_scenes import aircraft, aircraft_scene, range_filter, range_scene
+from ..results import SHOWN, Numbers
 from ..scenes import INTERVALS, Scene, Track
 from .drawing import in_space, legend_below, raised
-from .model import SHOWN, Drawing, Sketch, judge
+from .model import Drawing, Sketch, judge
 
-_DT, _WHEN = 0.05, "0 to 2.5, 2.5 to 5, 5 to 10 s"
+_DT = 0.05  # s
 _GOOD = 0.2  # m, RMSE at which the aircraft counts as tracked
 _NEEDED = 4  # ranges that trilateration needs
 
@@ -49,7 +51,7 @@ def _error_figure(
     run, n = _a_run(track), scene.task.vehicles
     t = _DT * np.arange(len(track.error))
     figure, axes = new_figure(4, 2, height=0.62, sharex=True, sharey="row")
-    numbers: dict[str, float | str] = {}
+    numbers: Numbers = {}
     right = []
     for column, vehicle in enumerate(vehicles):
         error, P = track.error[:, run, vehicle], track.P[:, run, vehicle]
@@ -73,8 +75,8 @@ def _error_figure(
         rmse = [usable.rmse(vehicle, part) for part in INTERVALS]
         sure = [usable.sigma(vehicle, part) for part in INTERVALS]
         who = f"vehicle {vehicle + 1}, {usable.error.shape[1]} of {track.error.shape[1]} runs"
-        numbers[f"{who}: RMSE, m, {_WHEN}"] = _list(rmse)
-        numbers[f"{who}: sqrt(tr P), m"] = _list(sure)
+        numbers[f"{who}: RMSE, m"] = by_interval(rmse)
+        numbers[f"{who}: sqrt(tr P), m"] = by_interval(sure)
         right += judged(held, rmse, sure)
     for axis, name in zip(axes[:, 0], ("x error, m", "y error, m", "z error, m", "held"), strict=True):
         axis.set_ylabel(name)
@@ -83,10 +85,6 @@ def _error_figure(
     shown = axes[0, int(np.argmax([len(axis.lines) for axis in axes[0]]))]
     legend_below(figure, shown, 3)
     return Drawing(figure, judge(*right), numbers)
-
-
-def _list(values: list[float]) -> str:
-    return ", ".join(f"{value:.3f}" for value in values)
 
 
 def _follows(held: NDArray[np.int64], rmse: list[float], sure: list[float]) -> list[bool]:

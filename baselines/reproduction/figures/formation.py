@@ -14,6 +14,7 @@ from quad_envs.parameters import POSITION, Array
 from ...evaluation.rollout import Episode
 from ...report.figures import house_style, new_figure
 from ..formation_claims import CONVERGED, KEPT, MODES, formation, reduced
+from ..results import NOT_REPRODUCED, Numbers
 from ..team_flights import TeamFlight, TeamOutcome, outcome_of, team_episodes
 from .drawing import VEHICLES, draw_plan, in_space, legend_below, raised
 from .model import Drawing, Sketch, judge
@@ -80,10 +81,10 @@ def _who(i: int) -> str:
     return "1, leader" if i == 0 else f"{i + 1}"
 
 
-def _verdict(shape: str, graph: str) -> tuple[str, dict[str, float | str]]:
+def _verdict(shape: str, graph: str) -> tuple[str, Numbers]:
     """Whether the formation closes; of a strong graph, whether it diverges less than with the weak one."""
     outcome = flown(shape, graph).outcome
-    numbers: dict[str, float | str] = {
+    numbers: Numbers = {
         "error of the worst vehicle after 20 s, m": outcome.final,
         "settling (all within 0.1 m), s": outcome.settling,
         "smallest distance of two vehicles, m": outcome.gap,
@@ -91,10 +92,14 @@ def _verdict(shape: str, graph: str) -> tuple[str, dict[str, float | str]]:
     if graph == "weak":
         return judge(outcome.final < CONVERGED, outcome.gap >= KEPT), numbers
     weak = flown(shape, "weak").outcome
-    numbers["largest height error, m (weak, strong)"] = f"{weak.height[0]:.3f}, {outcome.height[0]:.3f}"
-    numbers["rms height error, m (weak, strong)"] = f"{weak.height[1]:.3f}, {outcome.height[1]:.3f}"
-    numbers["rms error in x and y, m (weak, strong)"] = f"{weak.level:.3f}, {outcome.level:.3f}"
-    return judge(*reduced(weak, outcome)), numbers
+    for name, each in (("weak", weak), ("strong", outcome)):
+        numbers[f"{name} graph"] = {
+            "largest height error, m": f"{each.height[0]:.3f}",
+            "rms height error, m": f"{each.height[1]:.3f}",
+            "rms error in x and y, m": f"{each.level:.3f}",
+        }
+    word = judge(*reduced(weak, outcome))
+    return NOT_REPRODUCED if word == "FALSE" else word, numbers
 
 
 @house_style()
@@ -122,7 +127,7 @@ def stage_figure(shape: str, graph: str, jobs: int = 1) -> Drawing:
         axis.tick_params(labelleft=place % 3 == 0, labelbottom=place > 2, labelsize=6.5)
     legend_below(figure, space, _VEHICLES)
     gap = np.linalg.norm(wanted - path.p, axis=-1).max(axis=1)
-    numbers: dict[str, float | str] = {
+    numbers: Numbers = {
         f"largest distance of a vehicle to its reference at {time:g} s, m": float(
             gap[round(time / path.outcome.dt)]
         )

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..results import verdict
+from ..results import Numbers, verdict
 
-SHOWN = "SHOWN"  # the verdict where the source states nothing that could hold or fail
 REDRAWN = "Redrawn from our own flights: in the source the data of this figure is a picture only."
+DRAWN = "Drawn from our own graphs and formations: in the source this figure is a picture only."
 OWN = "Not in the source: an experiment of our own."
 
 
 class Drawing(NamedTuple):
     """A figure as it was drawn."""
 
-    figure: Any  # matplotlib's
-    verdict: str  # HOLDS, PARTLY or FALSE, computed from the numbers; or SHOWN
-    numbers: Mapping[str, float | str]
+    figure: Any  # matplotlib's, or the text of an SVG
+    verdict: str  # HOLDS, PARTLY, FALSE or NOT REPRODUCED, computed from the numbers; or SHOWN
+    numbers: Numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +37,7 @@ class Sketch:
     caption: str
     draw: Callable[[int], Drawing]
     claims: tuple[str, ...] = ()
+    flown: bool = True  # whether its data comes from flights
 
     @property
     def own(self) -> bool:
@@ -54,7 +55,7 @@ class Sketch:
     @property
     def whole_caption(self) -> str:
         """The caption, with where its data comes from."""
-        return f"{self.caption} {OWN if self.own else REDRAWN}"
+        return f"{self.caption} {OWN if self.own else REDRAWN if self.flown else DRAWN}"
 
 
 def judge(*right: bool) -> str:

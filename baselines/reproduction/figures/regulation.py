@@ -18,6 +18,7 @@ from ..regulation_claims import (
     regulation_flight,
     settled,
 )
+from ..results import Numbers
 from .drawing import LINEAR, NONLINEAR, draw_forces, legend_below, times
 from .model import Drawing, Sketch, judge
 
@@ -46,7 +47,7 @@ def _start(d: float, side: str) -> str:
 def state_figure(d: float, kappa: float, jobs: int = 1) -> Drawing:
     """Position against time, from below and from above."""
     figure, axes = new_figure(3, 2, height=0.75, sharex=True, sharey="row")
-    numbers: dict[str, float | str] = {}
+    numbers: Numbers = {}
     right = []
     for column, (side, pair) in enumerate(flown(d, kappa).items()):
         for outcome, (label, colour) in zip(pair, _CURVES, strict=True):
@@ -81,7 +82,7 @@ def _told(outcome: Outcome) -> str:
 def input_figure(d: float, kappa: float, jobs: int = 1) -> Drawing:
     """Rotor forces against time, from below and from above."""
     figure, axes = new_figure(2, 2, height=0.85, sharex=True)
-    numbers: dict[str, float | str] = {}
+    numbers: Numbers = {}
     right = []
     force_max = kappa * QuadrotorParams().weight
     for column, (side, pair) in enumerate(flown(d, kappa).items()):

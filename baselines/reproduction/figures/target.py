@@ -10,8 +10,8 @@ from quad_envs.envs.team.options import CHAPTER_7_SLOTS
 from quad_envs.parameters import POSITION, Array
 
 from ...report.figures import COLOURS, house_style, new_figure
-from ..formation_claims import metres
-from ..target_claims import CLOSE, estimate_error, flights, tracking_error
+from ..results import Numbers
+from ..target_claims import CLOSE, by_vehicle, estimate_error, flights, of_vehicles, tracking_error
 from .drawing import LIMIT, REFERENCE, VEHICLES, draw_plan, in_space, legend_below, raised
 from .formation import TeamPath, fly_path
 from .model import Drawing, Sketch, judge
@@ -36,13 +36,13 @@ def _target(path: TeamPath) -> Array:
     return np.asarray(_wanted(path)[:, 0] - np.array(CHAPTER_7_SLOTS[0]))
 
 
-def _verdict(case: int) -> tuple[str, dict[str, float | str]]:
+def _verdict(case: int) -> tuple[str, Numbers]:
     """Whether all stay with the target, those who have no contact to it, too."""
     outcome = flown(case).outcome
     error, estimate = tracking_error([outcome]), estimate_error([outcome])
-    numbers: dict[str, float | str] = {
-        "tracking error of vehicles 1 to 6, RMS of the last 5 s, m": metres(error.tolist()),
-        "error of their estimates of the target, m": metres(estimate.tolist()),
+    numbers: Numbers = {
+        "tracking error, RMS of the last 5 s, m": by_vehicle(error.tolist()),
+        "error of the estimates of the target, m": by_vehicle(estimate.tolist()),
         "smallest distance of two vehicles, m": outcome.gap,
     }
     return judge(bool((error < CLOSE).all())), numbers
@@ -120,10 +120,11 @@ def input_figure(case: int, jobs: int = 1) -> Drawing:
     legend_below(figure, axes[0, 0], 4)
     inside = bool((path.forces >= -1e-9).all() and (path.forces <= path.force_max + 1e-9).all())
     at_limit = np.isclose(path.forces, 0.0, atol=1e-6) | np.isclose(path.forces, path.force_max, atol=1e-6)
-    numbers: dict[str, float | str] = {
-        "smallest and largest command, N": f"{path.forces.min():.2f}, {path.forces.max():.2f}",
-        "share of commands at a limit, vehicles 1 to 6": ", ".join(
-            f"{share:.1%}" for share in at_limit.mean(axis=(0, 2))
+    numbers: Numbers = {
+        "smallest command, N": f"{path.forces.min():.2f}",
+        "largest command, N": f"{path.forces.max():.2f}",
+        "share of commands at a limit": dict(
+            zip(of_vehicles(), [f"{share:.1%}" for share in at_limit.mean(axis=(0, 2))], strict=True)
         ),
     }
     return Drawing(figure, judge(inside), numbers)
