@@ -37,6 +37,7 @@ from .rotations import sincos
 
 _PLANT = N_STATE + N_INPUT
 _MOST_SUBSTEPS = 64
+STAGE_ROWS = 14  # of scratch: stages of a substep, their sensitivities, the disturbance
 
 
 @inline_kernel
@@ -189,6 +190,62 @@ def _substep_vjp(
 
 
 @kernel
+def roll_out(
+    plant: Array, command: Array, force_max: Array, c: Array, substeps: int, h: float, past: Array, w: Array
+) -> None:
+    """Fly a control period without disturbance, as `step_vjp_kernel` takes it back.
+
+    Args:
+        plant: Before it, (16,).
+        command: Rotor commands, (4,), N.
+        force_max: Largest force of each rotor, (4,), N.
+        c: QuadrotorParams.coefficients().
+        substeps: RK4 steps.
+        h: Length of one, s.
+        past: Result: the plants before each substep and after the last, (substeps + 1, 16).
+        w: Scratch, (STAGE_ROWS, 16).
+    """
+    d, half = w[13], math.exp(-0.5 * c[ROTOR_RATE] * h)
+    for i in range(6):
+        d[i] = 0.0
+    for i in range(_PLANT):
+        past[0, i] = plant[i]
+    for s in range(substeps):
+        x, following = past[s], past[s + 1]
+        _stages(x[:N_STATE], x[N_STATE:], command, force_max, c, h, d, w, following)
+        _lag(x[N_STATE:], command, force_max, half * half, following[N_STATE:])
+
+
+@kernel
+def roll_back(
+    plant: Array,
+    command: Array,
+    force_max: Array,
+    c: Array,
+    h: float,
+    bar_plant: Array,
+    bar_command: Array,
+    w: Array,
+) -> None:
+    """Take bar_plant back over the substep that began at a plant; adds to bar_command.
+
+    Saturated commands have their influence still, see `forget_saturated`. Arguments as in `roll_out`, which
+    has left its disturbance in w.
+    """
+    half = math.exp(-0.5 * c[ROTOR_RATE] * h)
+    _stages(plant[:N_STATE], plant[N_STATE:], command, force_max, c, h, w[13], w, w[12])
+    _substep_vjp(h, half, c, w[13], w, bar_plant[:N_STATE], bar_plant[N_STATE:], bar_command)
+
+
+@inline_kernel
+def forget_saturated(command: Array, force_max: Array, bar_command: Array) -> None:
+    """A command outside the rotor box has no influence."""
+    for i in range(N_INPUT):
+        if not 0.0 <= command[i] <= force_max[i]:
+            bar_command[i] = 0.0
+
+
+@kernel
 def step_vjp_kernel(
     plant: Array,
     command: Array,
@@ -215,30 +272,18 @@ def step_vjp_kernel(
         bar_command: Result, (4,).
         w: Scratch, (SCRATCH_ROWS, 16).
     """
-    past, d = w[14:], w[13]
-    for i in range(6):
-        d[i] = 0.0
-    half = math.exp(-0.5 * c[ROTOR_RATE] * h)
-    for i in range(_PLANT):
-        past[0, i] = plant[i]
-    for s in range(substeps):
-        x, following = past[s], past[s + 1]
-        _stages(x[:N_STATE], x[N_STATE:], command, force_max, c, h, d, w, following)
-        _lag(x[N_STATE:], command, force_max, half * half, following[N_STATE:])
+    past = w[STAGE_ROWS:]
+    roll_out(plant, command, force_max, c, substeps, h, past, w)
     for i in range(_PLANT):
         bar_plant[i] = bar[i]
     for i in range(N_INPUT):
         bar_command[i] = 0.0
     for s in range(substeps - 1, -1, -1):
-        x = past[s]
-        _stages(x[:N_STATE], x[N_STATE:], command, force_max, c, h, d, w, past[s + 1])
-        _substep_vjp(h, half, c, d, w, bar_plant[:N_STATE], bar_plant[N_STATE:], bar_command)
-    for i in range(N_INPUT):
-        if not 0.0 <= command[i] <= force_max[i]:
-            bar_command[i] = 0.0
+        roll_back(past[s], command, force_max, c, h, bar_plant, bar_command, w)
+    forget_saturated(command, force_max, bar_command)
 
 
-SCRATCH_ROWS = 14 + _MOST_SUBSTEPS + 1
+SCRATCH_ROWS = STAGE_ROWS + _MOST_SUBSTEPS + 1
 
 
 @kernel

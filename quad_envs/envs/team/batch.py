@@ -21,6 +21,7 @@ from ...lanes import (
     MOST_VALUES,
     N_PLANT,
     N_TEAM,
+    STEP,
     Blocks,
 )
 from ...names import nearest_name, shown, unknown_name
@@ -35,7 +36,19 @@ from ..shared.given import given_plants
 from ..shared.packed_batch import PackedBatch
 from ..shared.tables import checked_rows, disturbance_rows, draw_vehicle, reference_rows, stage_times
 from ..shared.task_vector import task_vector
-from .exchange import DISTURBANCE, DRAW, HEAD, NOISE, PLAN, REFERENCE, TARGET, Tables
+from .exchange import (
+    DISTURBANCE,
+    DRAW,
+    HEAD,
+    LIFETIME,
+    NOISE,
+    PLAN,
+    REFERENCE,
+    SENT,
+    TARGET,
+    WEIGHT,
+    Tables,
+)
 from .kernel import N_TOLD, Teams, begin_teams, scratch_size, step_teams
 from .options import EstimationOptions, FormationOptions, TargetTrackingOptions, TeamOptions
 from .scores import N_LOSS
@@ -54,6 +67,7 @@ class TeamBatch(PackedBatch):
 
     options: TeamOptions
     task: TeamTask
+    _arrays: Teams
 
     def __init__(self, options: TeamOptions, teams: int) -> None:
         self.options, self.teams, self.task = options, teams, options.task
@@ -265,6 +279,18 @@ class TeamBatch(PackedBatch):
     def heard(self, t: int) -> Array:
         """Weight, sent, received of the last message in each comm slot of team t, a view, (N, K, 3)."""
         return self._messages[t * self.n : (t + 1) * self.n, :, :HEAD]
+
+    def ages(self) -> IntArray:
+        """Control steps since the message in each comm slot was sent, (n, K); -1 where none is valid."""
+        head = self._messages[:, :, :HEAD]
+        ages = self.vehicles.read(STEP)[:, None] - head[..., SENT]
+        valid = (head[..., WEIGHT] > 0.0) & (ages <= self._arrays.team[LIFETIME])
+        return np.where(valid, ages, -1.0).astype(np.int64)
+
+    @property
+    def arrays(self) -> Teams:
+        """What the kernels work on, for their adjoints."""
+        return self._arrays
 
     def step(self, actions: NDArray[np.float32], out: NDArray[np.float32], told: Array) -> None:
         """Move all teams by one control period, and write their observations and scores.

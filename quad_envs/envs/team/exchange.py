@@ -31,6 +31,7 @@ PLAN = MEASUREMENT + N_MEASURED  # (p, v) of each stage
 # Before the content, a message that was heard has these.
 WEIGHT, SENT, RECEIVED = 0, 1, 2  # G_ij (0: nothing heard); control steps at which it was sent, received
 HEAD = 3
+FAR = 1e9  # m, where those are who crashed, that nobody senses them
 
 # Entries of the team vector.
 (

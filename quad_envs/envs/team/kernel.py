@@ -50,6 +50,7 @@ from ..tracking.kernel import begin_lane, command, first_unsound, substep
 from .exchange import (
     DISTURBANCE,
     DRAW,
+    FAR,
     MEASUREMENT,
     N_MOTION,
     NOISE,
@@ -73,7 +74,6 @@ from .scores import N_LOSS, judge_estimate, judge_team
 PLAN_SCALE = 5.0  # m, and m/s: of the plan in an action, relative to the sender
 ESTIMATE_REACH = 20.0  # m: of an estimated position in an action, relative to the vehicle
 ESTIMATE_SPEED = 5.0  # m/s: of an estimated velocity in an action
-_FAR = 1e9  # m, where those are who crashed
 _POINT = 4 * LANES  # numbers of four places and their smallest squared distances, see `take_nearer`
 
 # Rows of what a step tells of n vehicles, (.., n) float64: numbers, counts as int64, flags as bytes, then the
@@ -136,7 +136,7 @@ def _gather(blocks: Array, row: Int, n: int, places: Array) -> None:
         for j in range(LANES):
             flies = (b * LANES + j < n) & (w[ALIVE + j] > 0.0)
             for c in range(3):
-                places[at + c * LANES + j] = w[row + c * LANES + j] if flies else _FAR * (b * LANES + j + 1)
+                places[at + c * LANES + j] = w[row + c * LANES + j] if flies else FAR * (b * LANES + j + 1)
 
 
 @kernel
@@ -238,7 +238,7 @@ def _inform(
         for c in range(N_MOTION):
             now[i, c] = told[i, c]
         for c in range(3):
-            places[c, i] = motions[i, c] if w[ALIVE + j] > 0.0 else _FAR
+            places[c, i] = motions[i, c] if w[ALIVE + j] > 0.0 else FAR
         if team[SENSOR_ROWS] > 0.0:
             aim = target[min(k, target.shape[0] - 1)]
             measure_target(motions[i], aim, draws, k, i, w[MEASURES + j], team, now[i, MEASUREMENT:])

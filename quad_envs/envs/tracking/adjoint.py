@@ -32,7 +32,7 @@ from ..shared.task_vector import (
 
 
 @kernel
-def _stage_cost_vjp(
+def stage_cost_vjp(
     x: Array, row: Array, command: Array, hover: float, Q: Array, R: Array, bar_x: Array, bar_command: Array
 ) -> None:
     """Gradient of the stage cost, `reward.stage_cost_kernel`, with respect to x (12,) and command (4,)."""
@@ -64,7 +64,7 @@ def _stage_cost_vjp(
 
 
 @kernel
-def _violation_vjp(
+def violation_vjp(
     x: Array,
     command: Array,
     previous: Array,
@@ -134,8 +134,8 @@ def reward_vjp(
     """
     loss = stage_cost_kernel(x, reference, command, task[HOVER], task[WEIGHT_Q], task[WEIGHT_R])
     cost_x, cost_command = work[:12], work[12:16]
-    cost = _violation_vjp(x, command, previous, task, bar_x, bar_command, bar_previous)
-    _stage_cost_vjp(x, reference, command, task[HOVER], task[WEIGHT_Q], task[WEIGHT_R], cost_x, cost_command)
+    cost = violation_vjp(x, command, previous, task, bar_x, bar_command, bar_previous)
+    stage_cost_vjp(x, reference, command, task[HOVER], task[WEIGHT_Q], task[WEIGHT_R], cost_x, cost_command)
     reward = (1.0 - min(1.0, cost)) / (1.0 + loss)
     along_v = bar_cost - (bar / (1.0 + loss) if cost < 1.0 else 0.0)
     along_l = -bar * reward / (1.0 + loss)
