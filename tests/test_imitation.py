@@ -161,6 +161,32 @@ def test_equal_seeds_give_equal_networks(algorithm, options):
     assert np.abs(onward - first[-1][1].weights[0]).max() < 4.0 * 1.1e-2
 
 
+def test_the_policy_gradient_goes_on_from_what_imitated_a_team():
+    task = training_options(FORMATION, {"vehicles": 3, "formation": "triangle", "time_limit": 2.0})
+    shared = {"n_envs": 7, "net_arch": (8,), "squash": "clip", "stages": (0, 2)}
+    imitating = DaggerOptions(n_steps=3, gradient_steps=1, final_gradient_steps=1, **shared)
+    steps = iter([0.0, 1.0])
+    ((_, start),) = dagger(task, imitating, 0, lambda: next(steps))
+
+    def learn(seed):
+        count = iter(range(4))
+        options = PolicyGradientOptions(n_steps=4, final_n_steps=6, penalty=1.0, separation=0.5, **shared)
+        return list(policy_gradient(task, options, seed, lambda: next(count) / 3, start))
+
+    (*_, (progress, network)), again = learn(0), learn(0)
+    assert progress.steps == 6 * (4 + 5 + 5) and network.features == start.features  # two teams of three
+    for before, a, b in zip(start.weights, network.weights, again[-1][1].weights, strict=True):
+        np.testing.assert_array_equal(a, b)
+        assert 0.0 < np.abs(a - before).max() < 4 * 1.1e-2
+
+
+@pytest.mark.parametrize("name", ["stages", "separation", "episode_steps"])
+def test_hyperparameters_of_teams_are_refused_for_one_vehicle(name):
+    given = PolicyGradientOptions(**{name: (0,) if name == "stages" else 1})
+    with pytest.raises(ValueError, match=rf"hyperparameter {name} = .* is for teams: leave it out"):
+        next(policy_gradient(training_options(HELIX, {}), given, 0, lambda: 0.0))
+
+
 def test_a_network_with_other_layers_is_no_start():
     wrong, steps = still(task_of(HELIX)), iter([0.0, 1.0])
     with pytest.raises(ValueError, match="give the same net_arch"):

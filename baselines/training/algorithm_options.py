@@ -44,7 +44,7 @@ _AUTO = re.compile(r"auto(_(?=[0-9.]*[1-9])[0-9]*\.?[0-9]+(e-?[0-9]+)?)?")
 class PolicyGradientOptions:
     """Hyperparameters of the analytic policy gradient."""
 
-    n_envs: int = 64  # flights at once
+    n_envs: int = 64  # flights at once, or vehicles of all teams
     n_steps: int = 25  # of each flight in an update, a window, at the beginning
     final_n_steps: int = 25  # and at the end; long windows see more of what follows, but learn late
     substeps: int = 2  # of the integrator while training; 5 in evaluation
@@ -56,6 +56,10 @@ class PolicyGradientOptions:
     penalty: float = 0.0  # weight of the violation cost in the objective
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers
     max_grad_norm: float = 1.0  # to which gradients are clipped
+    squash: Squash = "tanh"  # how outputs come into [-1, 1]; "clip" as what dagger makes of teams
+    stages: tuple[int, ...] | None = None  # of a team's preview, that the network sees; None: the usual ones
+    separation: float | None = None  # m, below which the cost counts a team's distances; None for the task's
+    episode_steps: int | None = None  # of a team's flight in training; None for the task's own
 
 
 @dataclass(frozen=True, slots=True)

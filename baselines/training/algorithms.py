@@ -51,7 +51,7 @@ ALGORITHMS: dict[str, Algorithm] = {
         "train",
         PolicyGradientOptions,
         "model-based",
-        (TRACKING,),
+        (TRACKING, FORMATION),
         "analytic policy gradient through the compiled dynamics",
     ),
     "dagger": Algorithm(

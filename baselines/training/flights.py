@@ -85,6 +85,9 @@ class DifferentiableFlights:
         """Scaled features of all flights as they are, (n, features)."""
         return self._encoder.see(self._out)
 
+    def begin_window(self, n_steps: int) -> None:
+        """A window of n_steps follows; observations reach back to no earlier step."""
+
     def observe_vjp(self, record: Record, bar: Floats) -> tuple[Array, Array]:
         """Sensitivities to plants (n, 16) and last commands (n, 4) before a step, from those to `observe`."""
         layout, full = self.task.layout, bar / np.asarray(self.features.scale)

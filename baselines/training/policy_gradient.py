@@ -4,6 +4,7 @@ Model-based: it knows the equations of motion and the reward. Windows of some st
 out and taken back; flights go on from window to window. The objective is
 sum_t gamma^t (log(r_t + eps) - w c_t) with the violation cost c: the gradient of the bounded reward itself
 vanishes where a flight is far off and where a violation exceeds its scale. Evaluation is on the reward alone.
+In a team all vehicles share the network, and each one's objective moves those that it hears and senses.
 """
 
 from __future__ import annotations
@@ -16,14 +17,17 @@ from typing import Any
 import numpy as np
 
 from quad_envs.encoding import hover_actions, hover_slopes
+from quad_envs.envs.team.options import TeamOptions
 from quad_envs.envs.tracking.options import TrackingOptions
 from quad_envs.observations.features import Features
 
 from ..errors import TrainingError
 from ..policies.network import Floats, Network, Squash
 from .algorithm_options import PolicyGradientOptions
+from .differentiable import Flights, S
 from .flights import DifferentiableFlights
 from .held_out import Progress
+from .team_flights import DifferentiableTeams
 
 
 class Actor:
@@ -91,18 +95,24 @@ class Actor:
 
 
 def _window_gradient(
-    actor: Actor, flights: DifferentiableFlights, options: PolicyGradientOptions, n_steps: int, epsilon: float
+    actor: Actor,
+    flights: Flights[S],
+    options: PolicyGradientOptions,
+    n_steps: int,
+    epsilon: float,
 ) -> float:
     """Roll a window out, take it back, leave the gradient in the actor's parameters; the mean reward."""
     import torch
 
     seen, outputs, records = [], [], []
+    flights.begin_window(n_steps)
     for _ in range(n_steps):
         x = torch.from_numpy(flights.observe()).requires_grad_()
         out = actor(x)
         seen.append(x)
         outputs.append(out)
-        records.append(flights.advance(hover_actions(out.detach().numpy(), flights.task)))
+        commanded = np.clip(out.detach().numpy(), -1.0, 1.0)
+        records.append(flights.advance(hover_actions(commanded, flights.task)))
     n = flights.n
     plants, commands = np.zeros((n, 16)), np.zeros((n, 4))
     for t in range(n_steps - 1, -1, -1):
@@ -112,7 +122,8 @@ def _window_gradient(
         actions, plants, commands = flights.advance_vjp(
             record, plants, commands, rewards, -weight * options.penalty
         )
-        slopes = hover_slopes(out.detach().numpy(), flights.task)
+        asked = out.detach().numpy()
+        slopes = hover_slopes(asked, flights.task) * (np.abs(asked) <= 1.0)
         out.backward(torch.from_numpy((actions * slopes).astype(np.float32)))
         assert x.grad is not None
         own, last = flights.observe_vjp(record, x.grad.numpy())
@@ -120,8 +131,31 @@ def _window_gradient(
     return float(np.mean([record.rewards for record in records]))
 
 
+def _flights_of(
+    task_options: TrackingOptions | TeamOptions, options: PolicyGradientOptions, seed: int
+) -> Flights[Any]:
+    """Flights to train in.
+
+    Raises:
+        ValueError: If the task cannot be differentiated, or a hyperparameter is for the other kind of task.
+    """
+    if isinstance(task_options, TeamOptions):
+        cycles = options.episode_steps or task_options.task.episode_steps
+        trained = replace(
+            task_options,
+            terminate="team",
+            substeps=options.substeps,
+            max_cycles=min(cycles, task_options.task.episode_steps),
+        )
+        return DifferentiableTeams(trained, options.n_envs, seed, options.stages, options.separation)
+    for name in ("stages", "separation", "episode_steps"):
+        if getattr(options, name) is not None:
+            raise ValueError(f"hyperparameter {name} = {getattr(options, name)!r} is for teams: leave it out")
+    return DifferentiableFlights(replace(task_options, substeps=options.substeps), options.n_envs, seed)
+
+
 def train(
-    task_options: TrackingOptions,
+    task_options: TrackingOptions | TeamOptions,
     options: PolicyGradientOptions,
     seed: int,
     spent: Callable[[], float],
@@ -130,7 +164,7 @@ def train(
     """Train, and yield after each update.
 
     Args:
-        task_options: Of the tracking environment.
+        task_options: Of the environment.
         options: Hyperparameters.
         seed: Of everything random.
         spent: Share of the budget that is used up, 0 to 1; training ends at 1.
@@ -143,8 +177,8 @@ def train(
     import torch
 
     torch.manual_seed(seed)
-    flights = DifferentiableFlights(replace(task_options, substeps=options.substeps), options.n_envs, seed)
-    actor = Actor(len(flights.features.names), options.net_arch, 4)
+    flights = _flights_of(task_options, options, seed)
+    actor = Actor(len(flights.features.names), options.net_arch, 4, options.squash)
     if start is not None:
         actor.load(start, flights.features)
     optimizer = torch.optim.Adam(actor.parameters, lr=options.learning_rate)
@@ -161,5 +195,6 @@ def train(
             raise TrainingError(f"the gradient is {norm} at update {update}: the last good policy is kept")
         optimizer.step()
         update += 1
-        steps += options.n_envs * n_steps
-        yield Progress(update, steps, reward), Network(flights.features, *actor.arrays())
+        steps += flights.n * n_steps
+        network = Network(flights.features, *actor.arrays(), squash=options.squash)
+        yield Progress(update, steps, reward), network

@@ -2,7 +2,8 @@
 
 For policy gradients through the dynamics of many teams: sensitivities pass from a vehicle to those that hear
 it, sense it, or are scored beside it. The forward pass is the environments' own kernel. Given and not
-differentiated are: who is heard, sensed and nearest, the age of a message, and measurements of a target.
+differentiated are: who is heard, sensed and nearest, the age of a message, measurements of a target,
+disturbances and the noise of sensors.
 """
 
 from __future__ import annotations
@@ -61,6 +62,7 @@ class TeamRecord(NamedTuple):
     plants: Array  # (n, 16)
     previous: Array  # (n, 4), N, commands of the step before
     commands: Array  # (n, 4), N, of this step
+    after: Array  # (n, 16), plants afterwards
     wanted: Array  # (n, N_TABLE), where each should be after it
     steps: IntArray  # (n,), control step of the episode
     ages: IntArray  # (n, K), control steps since the message in each comm slot was sent; -1: nothing valid
@@ -270,6 +272,7 @@ def advance_teams_vjp(
                     record.plants[r], record.commands[r], record.force_max[r], record.coefficients[r],
                     substeps, h, scratch.past[i], scratch.stages,
                 )  # fmt: skip
+                scratch.past[i, substeps] = record.after[r]
         for i in range(n):
             r = first + i
             if record.flew[r] and not record.crashed[r]:
