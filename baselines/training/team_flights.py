@@ -1,9 +1,9 @@
 """Flights of teams as a differentiable function of the actions of all vehicles.
 
 The forward pass is the environments' compiled step: resets, disturbances and sensor noise included. The
-backward pass is its adjoint without those two, in which sensitivities pass between vehicles by the rewards, by
-what is sensed and by messages, back to the step in which these were sent. No gradient passes through a new
-beginning.
+backward pass is its adjoint without the last two, in which sensitivities pass between vehicles by rewards,
+by what is sensed and by messages, back to the step in which these were sent. No gradient passes through a
+new beginning.
 """
 
 from __future__ import annotations
