@@ -30,7 +30,7 @@ from .protocol import protocol_facts, refuse_other_version
 from .stages import price
 from .suite import Suite
 from .unit_flights import fly_unit, timed_unit
-from .units import Given, Unit, suite_units, training_units
+from .units import Given, TrainingUnit, Unit, suite_units, training_units
 
 REPORTED = 2  # flights of each unit that are saved for the report where not all are asked for
 
@@ -53,7 +53,7 @@ class Order:
     """How a suite is to be flown; the comment of a field is its documentation everywhere."""
 
     engine: str = "processes"  # or "ray" or "dask"
-    jobs: int = 1  # units flown at a time
+    jobs: int | None = None  # units flown at a time; one here, all that a cluster has, if not given
     save_episodes: bool = (
         False  # whether to write every flight to out/episodes, and not only the first REPORTED of each unit,
         # which the report shows
@@ -102,7 +102,6 @@ class Sweep:
         engine, jobs = self.order.engine, self.order.jobs
         report = self.order.on_unit or (lambda finished, total: None)
         total = len(self.to_train) + len(self.units)
-        left = [unit for unit in self.units if not (unit.number in self.flown or unit.number in self.failed)]
         report(self.done, total)
         for number in self.failed:
             self._warn(number)
@@ -110,16 +109,21 @@ class Sweep:
         if watcher is not None and self.to_train:
             watcher.trained(0, len(self.to_train))
         for number, training in run_units(train_unit, self.to_train, engine, jobs):
+            if "failure" in training:
+                self._lose(self.to_train[number], training["failure"])
+                continue
             self.trained[number] = training
             report(self.done, total)
             if watcher is not None:
                 watcher.trained(len(self.trained), len(self.to_train))
-        if jobs == 1:  # in parallel the long ones would be left over in the end
+        left = [unit for unit in self.units if not (unit.number in self.flown or unit.number in self.failed)]
+        alone = engine == "processes" and (jobs or 1) == 1
+        if alone:  # in parallel the long ones would be left over in the end
             places = {unit.env.title: i for i, unit in reversed(list(enumerate(left)))}
             left.sort(key=lambda unit: (places[unit.env.title], price(unit)))
         if watcher is not None:
             watcher.ready(left)
-        if jobs > 1:  # before others take the cores
+        else:  # before others take the cores
             left = [timed_unit(unit) for unit in left]
         for number, cell in run_units(fly_unit, left, engine, jobs):
             if "failure" in cell:
@@ -132,6 +136,13 @@ class Sweep:
             report(self.done, total)
             if watcher is not None and number in self.flown:
                 watcher.flown(self.units[number], Evaluation.from_plain(cell["found"]))
+
+    def _lose(self, training: TrainingUnit, why: str) -> None:
+        """Nothing flies that needs this network."""
+        for unit in self.units:
+            if unit.policy is training.policy and unit.policy_name == str(training.folder):
+                self.failed[unit.number] = f"its network could not be trained: {why}"
+                self._warn(unit.number)
 
     def _warn(self, number: int) -> None:
         """Say at once, and not only in the end, that one of several units broke off."""
@@ -158,7 +169,7 @@ class Sweep:
         results = Results(
             self.suite,
             tuple(Evaluation.from_plain(self.flown[unit.number]["found"]) for unit in flown),
-            tuple(self.trained[unit.number] for unit in self.to_train),
+            tuple(self.trained.get(unit.number, {}) for unit in self.to_train),
             failures,
         )
         if self.folder is not None:
