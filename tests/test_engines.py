@@ -2,6 +2,8 @@
 
 import json
 import os
+import pickle
+import shutil
 import signal
 import subprocess
 import sys
@@ -9,12 +11,19 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 
 from baselines import run_benchmark
 from baselines.errors import ResultsError
+from baselines.evaluation.evaluate import Evaluation
+from baselines.policies.trained import SHIPPED
 from baselines.sweeps import engines
 from baselines.sweeps.engines import run_units
+from baselines.sweeps.inputs import read_files
+from baselines.sweeps.suite import EnvChoice, PolicyChoice
+from baselines.sweeps.unit_flights import fly_unit
+from baselines.sweeps.units import Unit
 
 SUITE = {
     "name": "small",
@@ -41,6 +50,13 @@ def work(job):
     if job.number == 5:
         raise RuntimeError("five is\nnot liked")
     return {"square": job.number**2, "process": os.getpid()}
+
+
+def write_table(path):
+    """A trajectory to follow."""
+    t = np.linspace(0.0, 10.0, 21)
+    rows = np.column_stack([t, 0.2 * t, 0.0 * t, -1.0 + 0.0 * t])
+    np.savetxt(path, rows, delimiter=",", header="t,x,y,z", comments="")
 
 
 def without_times(rows):
@@ -89,6 +105,24 @@ def test_processes_end_soon_after_a_sweep_that_is_killed(tmp_path):
         time.sleep(0.2)
 
 
+def test_a_unit_brings_its_files_to_where_they_are_not(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_table("ref.csv")
+    shutil.copytree(SHIPPED / "apg-helix", "net")
+    env = EnvChoice("quad/HelixTracking-v0", {"reference": "ref.csv", "tilt_limit": 0.4})
+    unit = Unit(0, env, PolicyChoice("safe:./net"), "safe:./net", 2, 0, 1)
+    here = fly_unit(unit)
+    away = unit._replace(files=read_files(unit))
+    shutil.rmtree("net")
+    Path("ref.csv").unlink()
+    there = pickle.loads(pickle.dumps(away))
+    found = [Evaluation.from_plain(flown["cell"]["found"]) for flown in (here, fly_unit(there))]
+    assert [record.score for record in found[0].records] == [record.score for record in found[1].records]
+    assert found[0].policy == found[1].policy
+    with pytest.raises(FileNotFoundError):
+        fly_unit(unit)
+
+
 class Cluster:
     """A Dask cluster of two processes on this machine, each in a folder of its own."""
 
@@ -135,21 +169,26 @@ def cluster(tmp_path, monkeypatch):
     found.close()
 
 
-@pytest.mark.slow  # starts three processes that import everything
-def test_a_sweep_joins_a_dask_cluster_whose_workers_die_and_finds_the_same(cluster, tmp_path):
-    finished = []
+@pytest.mark.slow  # starts three processes that import everything, and trains two networks
+def test_a_sweep_joins_a_dask_cluster_whose_workers_die_and_finds_the_same(cluster, tmp_path, monkeypatch):
+    """The workers are in another folder, so that the relative path of the table means nothing to them."""
+    monkeypatch.chdir(tmp_path)
+    write_table("ref.csv")
+    train = {"name": "apg", "train": {"steps": 2000, "seeds": [0, 1]}, "envs": ["quad/HelixTracking-v0"]}
+    table = {"id": "quad/LineTracking-v0", "kwargs": {"reference": "ref.csv"}}
+    suite = {**SUITE, "envs": ["quad/HelixTracking-v0", table], "policies": ["hover", "lqr", train]}
+    killed = []
 
     def on_unit(count, total):
-        if count == 2 and not finished:
-            finished.append(count)
-            cluster.workers[0].kill()
+        if count in (1, 3) and len(killed) < count:
+            cluster.workers[len(killed)].kill()
+            killed.append(count)
             cluster.add()
 
-    there = run_benchmark(SUITE, tmp_path / "there", engine="dask", on_unit=on_unit)
-    here = run_benchmark(SUITE, tmp_path / "here")
-    assert finished and not there.failures
+    there = run_benchmark(suite, "there", engine="dask", on_unit=on_unit)
+    assert killed and not there.failures and len(there.trainings) == 2
+    shutil.copytree("there/networks", "here/networks")
+    here = run_benchmark(suite, "here", jobs=2)
     assert without_times(there.rows()) == without_times(here.rows())
-    names = [
-        sorted(path.name for path in (tmp_path / place / "episodes").iterdir()) for place in ("there", "here")
-    ]
+    names = [sorted(path.name for path in Path(place, "episodes").iterdir()) for place in ("there", "here")]
     assert names[0] == names[1] and len(names[0]) == 12

@@ -231,7 +231,7 @@ def benchmark_suite(options: BenchmarkOptions) -> int:
     def on_unit(count: int, total: int) -> None:
         nonlocal finished
         if finished < 0 and suite.learned:  # all is checked, and nothing begun
-            say(budget_of(suite).said(options.jobs))
+            say(budget_of(suite).said(options.jobs or 1))
         finished = count
         raise_lost()
 

@@ -149,16 +149,27 @@ def _found_again(path: list[str], source: str, work: Callable[[Any], Any], paylo
 @contextmanager
 def _processes(jobs: int | None) -> Iterator[Submit]:
     """Processes of this machine, which end when this one does, however it ends."""
-    from joblib.externals.loky import get_reusable_executor
+    from joblib.externals.loky import ProcessPoolExecutor
+    from joblib.externals.loky.process_executor import BrokenProcessPool
 
-    def executor() -> Any:  # a new one where a process has died
-        return get_reusable_executor(max_workers=jobs, initializer=_end_with, initargs=(os.getpid(),))
+    def begin() -> Any:
+        return ProcessPoolExecutor(jobs, initializer=_end_with, initargs=(os.getpid(),))
+
+    pool = begin()
+
+    def submit(*call: Any) -> Future[Any]:
+        nonlocal pool
+        try:
+            found: Future[Any] = pool.submit(*call)
+        except BrokenProcessPool:  # one of its processes has died
+            pool = begin()
+            found = pool.submit(*call)
+        return found
 
     try:
-        yield lambda *call: executor().submit(*call)
-    except BaseException:
-        executor().shutdown(wait=False, kill_workers=True)
-        raise
+        yield submit
+    finally:
+        pool.shutdown(wait=False, kill_workers=True)
 
 
 def _end_with(parent: int) -> None:
