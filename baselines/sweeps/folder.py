@@ -110,7 +110,8 @@ def read_run(folder: Path) -> Run:
     check_stored(folder, config, suite)
     units = suite_units(suite, suite.episodes)
     stored = [(unit, [cell.path for cell in cells_of(folder, unit)]) for unit in units]
-    finished = tuple(_finished(unit, paths, folder / EPISODES) for unit, paths in stored if paths)
+    read = (_finished(unit, paths, folder / EPISODES) for unit, paths in stored if paths)
+    finished = tuple(one for one in read if one.evaluation.flights == suite.episodes)  # others are under way
     if not finished:
         raise ResultsError(
             f"nothing in {str(folder)!r} is finished yet; run the same command again: it "
