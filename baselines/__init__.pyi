@@ -13,6 +13,10 @@ from .evaluation.metrics import paired_difference as paired_difference
 from .evaluation.rollout import Episode as Episode
 from .evaluation.rollout import run_episodes as run_episodes
 from .policies.conformance import check_policy as check_policy
+from .policies.disturbance_wrappers import DisturbanceEstimateWrapper as DisturbanceEstimateWrapper
+from .policies.disturbance_wrappers import (
+    VectorDisturbanceEstimateWrapper as VectorDisturbanceEstimateWrapper,
+)
 from .policies.estimate_wrapper import EstimateWrapper as EstimateWrapper
 from .policies.export import export_policy as export_policy
 from .policies.protocol import Policy as Policy

@@ -244,7 +244,7 @@ def endless(path):
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda folder: describe(folder, format=4), "has format 4, this version reads 1 to 3"),
+        (lambda folder: describe(folder, format=5), "has format 5, this version reads 1 to 4"),
         (
             lambda folder: describe(folder, mission="formation", env_id=FORMATION),
             "trained on 'quad/Formation",

@@ -95,9 +95,9 @@ def test_training_integrates_with_the_substeps_of_its_hyperparameters(monkeypatc
     seen = []
 
     class Watched(DifferentiableFlights):
-        def __init__(self, options, n, seed):
+        def __init__(self, options, *more):
             seen.append(options.substeps)
-            super().__init__(options, n, seed)
+            super().__init__(options, *more)
 
     monkeypatch.setattr("baselines.training.policy_gradient.DifferentiableFlights", Watched)
     next(train(training_options(RANDOM, {}), replace(OPTIONS, n_envs=2, substeps=3), 0, lambda: 0.0))

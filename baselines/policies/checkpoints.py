@@ -23,9 +23,10 @@ from quad_envs.observations.features import Features
 
 from ..errors import CheckpointError, ResultsError
 from ..files import write_atomic
+from .disturbance_estimate import sees_estimate
 from .network import Network
 
-FORMAT = 3  # rises when an older suite could not read a checkpoint
+FORMAT = 4  # rises when an older suite could not read a checkpoint
 _OLDEST = 1  # that this version reads
 WEIGHTS, DESCRIPTION = "network.safetensors", "policy.json"
 _LARGEST = 50_000_000  # bytes; the networks here are a thousandth of it
@@ -138,7 +139,12 @@ def load_checkpoint(folder: str | Path) -> tuple[Network, dict[str, Any]]:
 
 
 def _format_of(network: Network) -> int:
-    """The lowest that says all of a network: 2 has relu layers and cut features, 3 a range of commands."""
+    """The lowest that says all of a network.
+
+    2 has relu layers and cut features, 3 a range of commands, 4 an estimate among features.
+    """
+    if sees_estimate(network.features):
+        return 4
     if network.command_range != 1.0:
         return 3
     return 1 if network.activation == "tanh" and network.features.clip is None else 2

@@ -14,6 +14,7 @@ from quad_envs.tasks import TeamTask
 
 from ..errors import CheckpointError
 from .checkpoints import DESCRIPTION, save_checkpoint
+from .disturbance_estimate import sees_estimate, with_estimate
 from .environments import find_task, task_of
 from .network import Network, Squash
 from .normalisation import Normalisation, read_normalisation
@@ -202,7 +203,7 @@ def _encoded_features(encoder: Encoder, task: Any, seen: Normalisation | None) -
     features = encoder.encoding.features
     if task is not None:
         try:
-            features.columns(task.layout)
+            features.columns((with_estimate(task) if sees_estimate(features) else task).layout)
         except ValueError as error:
             raise CheckpointError(f"the network is of another task than {task.env_id}: {error}") from error
     if seen is None:

@@ -12,6 +12,7 @@ from quad_envs.names import shown
 from quad_envs.tasks import BaseTask
 from quad_envs.wrappers.vector import FilterAndRescale
 
+from .disturbance_wrappers import DisturbanceEstimateWrapper, VectorDisturbanceEstimateWrapper
 from .environments import find_task
 
 _REWRITERS = (
@@ -20,6 +21,8 @@ _REWRITERS = (
     gymnasium.vector.VectorObservationWrapper,
     gymnasium.vector.VectorActionWrapper,
     FilterAndRescale,
+    DisturbanceEstimateWrapper,
+    VectorDisturbanceEstimateWrapper,
 )
 _HARMLESS = (
     gymnasium.wrappers.FlattenObservation,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from quad_envs.encoding import Encoder
 
 from ..errors import CheckpointError, MissingPackageError, PolicyError
+from .disturbance_estimate import sees_estimate
 from .network import NetworkPolicy
 from .normalisation import Normalisation, read_normalisation
 from .protocol import Actions
@@ -124,5 +125,10 @@ def _policy_of(model: Any, file: ModelFile, vecnormalize: str | Path | None, nam
         raise CheckpointError(
             f"{str(vecnormalize)!r} is of another task: it has statistics of {normalisation.mean.size} "
             f"numbers, the model sees {size}"
+        )
+    if file.encoder is not None and sees_estimate(file.encoder.encoding.features):
+        raise CheckpointError(
+            f"{name!r} sees an estimate of the disturbance, for which the vehicle has to be known: make a "
+            "checkpoint of its zip, `quad-envs export model.zip FOLDER`, and fly that"
         )
     return Sb3Policy(model, normalisation, name, file.encoder)

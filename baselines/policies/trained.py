@@ -15,6 +15,7 @@ from ..errors import CheckpointError
 
 if TYPE_CHECKING:
     from .network import NetworkPolicy
+    from .network_policies import EstimatingPolicy
 
 SHIPPED = Path(__file__).parent / "shipped"  # one checkpoint per folder, as "apg-helix"
 _DESCRIPTION = "policy.json"
@@ -75,7 +76,7 @@ def _is_shipped(name: str) -> bool:
     return os.path.isfile(SHIPPED / name / _DESCRIPTION)
 
 
-def load_policy(source: str | os.PathLike[str], env: Any) -> NetworkPolicy:
+def load_policy(source: str | os.PathLike[str], env: Any) -> NetworkPolicy | EstimatingPolicy:
     """A trained network as a policy; no code of the checkpoint runs, and no torch is needed.
 
     Args:
@@ -87,7 +88,7 @@ def load_policy(source: str | os.PathLike[str], env: Any) -> NetworkPolicy:
     """
     from .checkpoints import load_checkpoint
     from .environments import task_of
-    from .network import NetworkPolicy
+    from .network_policies import network_policy
 
     folder = checkpoint_folder(source)
     network, said = load_checkpoint(folder)
@@ -100,7 +101,7 @@ def load_policy(source: str | os.PathLike[str], env: Any) -> NetworkPolicy:
         )
     name = os.fspath(source) if folder.parent == SHIPPED else folder.name or str(folder)
     try:
-        return NetworkPolicy(network, task, name, str(said.get("kind", "")))
+        return network_policy(network, task, name, str(said.get("kind", "")))
     except ValueError as error:
         raise CheckpointError(f"{where} does not fit {task.env_id}: {error}") from error
 

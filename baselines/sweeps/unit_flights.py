@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -19,24 +19,20 @@ from ..evaluation.episode import Episode
 from ..evaluation.evaluate import fly_and_measure
 from ..evaluation.rollout import check_flights, time_decisions
 from ..evaluation.row_forms import has_row_form
+from ..files import write_atomic
 from ..policies.environments import make_env
 from ..policies.registry import from_outside, make_policy, policy_name
 from .folder import task_facts
-from .inputs import at_hand
 from .units import Unit
 
 
 def fly_unit(unit: Unit) -> dict[str, Any]:
-    """Fly one unit, or a block of its flights.
+    """Fly one unit; the form in which it is stored in cells/, or what went wrong as "failure".
 
-    Returns:
-        "cell", the form in which it is stored in cells/, and "flights", the content of each file in episodes/
-        by its name; or what went wrong as "failure". A policy from outside that breaks off is a finding of
-        the sweep, whose other units go on.
+    A policy from outside that breaks off is a finding of the sweep, whose other units go on.
     """
     try:
-        with at_hand(unit) as (here, places):
-            return _fly(here, places)
+        return _fly(unit)
     except ResultsError:
         raise
     except ValueError as error:
@@ -69,16 +65,15 @@ def _made(unit: Unit) -> tuple[Any, Any]:
     return env, make_policy(unit.source, env, **unit.options)
 
 
-def _fly(unit: Unit, places: Mapping[str, str]) -> dict[str, Any]:
+def _fly(unit: Unit) -> dict[str, Any]:
     begin = perf_counter()
     env, policy = _made(unit)
-    flights: dict[str, bytes] = {}
-    save = _saver(unit, env, flights)
+    save = None if unit.episode_folder is None else _saver(unit, env)
 
     def on_episode(episode: Episode) -> None:
-        save(episode)
-        if unit.given.on_episode is not None:
-            unit.given.on_episode(episode)
+        for hear in (save, unit.given.on_episode):
+            if hear is not None:
+                hear(episode)
 
     found = fly_and_measure(
         policy,
@@ -90,37 +85,34 @@ def _fly(unit: Unit, places: Mapping[str, str]) -> dict[str, Any]:
         timed=unit.timed,
     )
     if unit.given.policy is None:
-        name = policy_name(policy, unit.policy_name)
-        for text, place in places.items():
-            name = name.replace(place, text)
-        found = replace(found, policy=name)
+        found = replace(found, policy=policy_name(policy, unit.policy_name))
     if unit.given.env is None:
         env.close()
     seconds = perf_counter() - begin
-    cell = {
+    return {
         "env": unit.env.title,
         "policy": unit.policy.title,
         "seconds": seconds,
         "task": task_facts(env.unwrapped.task),
-        "flights_saved": len(flights),
+        "flights_saved": len(unit.episode_files()),
         "found": found.to_plain(),
     }
-    return {"cell": cell, "flights": flights}
 
 
-def _saver(unit: Unit, env: Any, flights: dict[str, bytes]) -> Callable[[Episode], None]:
-    """Adds the flights that are wanted, each when all vehicles of a team have given theirs."""
+def _saver(unit: Unit, env: Any) -> Callable[[Episode], None]:
+    """Writes the flights that are wanted to episodes/, each when all vehicles of a team have given theirs."""
     team: list[Episode] = []
 
     def save(episode: Episode) -> None:
         team.append(episode)
         if len(team) < episode.team_size:
             return
-        if episode.seed < unit.save_before:
+        path = unit.episode_file(episode.seed)
+        if path is not None:
             arrays: dict[str, Any] = flight_arrays(team) | _graphs(env)
             buffer = io.BytesIO()
             np.savez_compressed(buffer, **arrays)
-            flights[unit.episode_name(episode.seed)] = buffer.getvalue()
+            write_atomic(path, buffer.getvalue())
         team.clear()
 
     return save

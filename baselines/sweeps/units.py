@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,20 +51,15 @@ class Unit(NamedTuple):
     policy_name: str  # for make_policy
     episodes: int
     seed: int
-    save_before: int = 0  # flights from starts below this seed are saved
+    episode_folder: Path | None  # where to save flights
+    flights_saved: int = 0  # how many, the first ones
     given: Given = Given()
     timed: tuple[Array, ...] | None = None  # its decisions, where they were timed before the flights
-    files: Mapping[str, Mapping[str, bytes]] | None = None  # brought to another machine, see `inputs`
 
     @property
     def named(self) -> bool:
         """Whether names alone say what is flown, so that a stored result stands for it."""
         return all(value is None or value is False for value in self.given)
-
-    @property
-    def starts(self) -> range:
-        """Seeds of its flights."""
-        return range(self.seed, self.seed + self.episodes)
 
     @property
     def source(self) -> Any:
@@ -78,24 +72,29 @@ class Unit(NamedTuple):
         return {} if self.policy.made is not None else self.policy.kwargs
 
     @property
-    def name(self) -> str:
-        """Its name in file names: readable, and another one for other titles."""
-        return _file_name(f"{self.env.title}--{self.policy.title}")
+    def file_name(self) -> str:
+        """Name of its file in cells/."""
+        return f"{self.number:03d}-{_slug(f'{self.env.title}--{self.policy.title}')}.json"
 
-    def episode_name(self, seed: int) -> str:
-        """Name of the file of a flight that is saved."""
-        return f"{self.name}-{seed}.npz"
+    def episode_file(self, seed: int) -> Path | None:
+        """File of the flight with a seed; None if it is not saved."""
+        if self.episode_folder is None or seed >= self.seed + self.flights_saved:
+            return None
+        return self.episode_folder / f"{self.file_name.removesuffix('.json')}-{seed}.npz"
+
+    def episode_files(self) -> list[Path]:
+        """Files of its flights that are saved."""
+        files = (self.episode_file(self.seed + i) for i in range(self.episodes))
+        return [file for file in files if file is not None]
 
 
-def _file_name(text: str) -> str:
-    """A text as a part of file names; its digest tells apart what differs in other characters only."""
-    slug = "".join(c if c.isascii() and c.isalnum() else "-" for c in text)[:80]
-    return f"{slug}-{hashlib.sha256(text.encode()).hexdigest()[:6]}"
+def _slug(text: str) -> str:
+    return "".join(c if c.isalnum() else "-" for c in text)[:80]
 
 
 def _trained_folder(env: EnvChoice, policy: PolicyChoice, networks: Path) -> Path:
     """Where the network of a policy for an environment is."""
-    return networks / _file_name(f"{env.title}--{policy.title}")
+    return networks / _slug(f"{env.title}--{policy.title}")
 
 
 def training_units(suite: Suite, networks: Path = Path("networks")) -> list[TrainingUnit]:
@@ -116,6 +115,7 @@ def training_units(suite: Suite, networks: Path = Path("networks")) -> list[Trai
 
 def suite_units(
     suite: Suite,
+    episodes: Path | None = None,
     flights_saved: int = 0,
     networks: Path = Path("networks"),
 ) -> list[Unit]:
@@ -123,7 +123,8 @@ def suite_units(
 
     Args:
         suite: The suite.
-        flights_saved: How many of each unit are saved, the first ones.
+        episodes: Folder in which flights are saved; None if they are not.
+        flights_saved: How many of each unit, the first ones.
         networks: Folder of what the suite trains or tunes.
     """
     units: list[Unit] = []
@@ -133,7 +134,7 @@ def suite_units(
                 if policy.conditions and condition not in policy.conditions:
                     continue
                 name, number = _policy_name(env, policy, networks), len(units)
-                flights = suite.episodes, suite.seed, suite.seed + flights_saved
+                flights = suite.episodes, suite.seed, episodes, flights_saved
                 units.append(Unit(number, flown, policy, name, *flights))
     return units
 

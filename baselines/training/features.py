@@ -12,25 +12,31 @@ from quad_envs.observations.features import Features, default_features
 
 
 def training_features(
-    options: TrackingOptions | TeamOptions, stages: tuple[int, ...] | None = None
+    options: TrackingOptions | TeamOptions,
+    stages: tuple[int, ...] | None = None,
+    disturbance_estimate: bool = False,
 ) -> Features:
     """The default features without comm slots that nobody fills in this task's graphs.
 
     Args:
         options: Of the task.
         stages: Preview stages to keep; None for the usual ones.
+        disturbance_estimate: Whether the network sees an estimate of the disturbance, too.
 
     Raises:
-        ValueError: If the preview has not these stages.
+        ValueError: If the preview has not these stages, or the estimate is asked for in a team.
     """
     layout = options.task.layout
     if stages is not None and not set(stages) <= set(range(layout.preview + 1)):
         raise ValueError(
             f"hyperparameter stages: the preview has stages 0 to {layout.preview}, got {shown(stages)}"
         )
-    features = default_features(layout, stages)
     if not isinstance(options, TeamOptions):
-        return features
+        own = replace(options.task.layout, disturbance_estimate=disturbance_estimate)
+        return default_features(own, stages)
+    if disturbance_estimate:
+        raise ValueError(estimate_in_team(options))
+    features = default_features(layout, stages)
     used = in_neighbours(options.graphs.graphs).shape[1]
     empty = tuple(
         name
@@ -45,4 +51,12 @@ def training_features(
         names=tuple(features.names[k] for k in kept),
         mean=tuple(features.mean[k] for k in kept),
         scale=tuple(features.scale[k] for k in kept),
+    )
+
+
+def estimate_in_team(options: TeamOptions) -> str:
+    """What to say where the estimate is asked for in a team."""
+    return (
+        f"hyperparameter disturbance_estimate is for one vehicle, and {options.env_id} has several: "
+        "leave it out"
     )

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_envs.adjoint import SCRATCH_ROWS
-from quad_envs.encoding import Encoder, Encoding
+from quad_envs.encoding import Encoding
 from quad_envs.envs.shared.task_vector import task_vector
 from quad_envs.envs.tracking.adjoint import action_slopes, tracking_vjp_rows
 from quad_envs.envs.tracking.batch import TrackingBatch
@@ -22,10 +22,13 @@ from quad_envs.envs.tracking.options import TrackingOptions
 from quad_envs.envs.tracking.scores import scores_of
 from quad_envs.lanes import COEFFICIENTS, COMMAND, FORCE_MAX, N_PLANT, PLANT, STEP
 from quad_envs.names import shown
-from quad_envs.observations.features import Features, default_features, preview_stages
+from quad_envs.observations.features import Features, preview_stages
 from quad_envs.observations.tracking import N_OWN, N_REFERENCE
 from quad_envs.parameters import N_COEFFICIENTS
 from quad_envs.plant import N_INPUT, Array
+
+from .features import training_features
+from .observer import Observer
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float32]
@@ -56,20 +59,23 @@ class DifferentiableFlights:
         options: Of the task; its reward must be the bounded one.
         n: Number of flights.
         seed: Of the starts.
+        disturbance_estimate: Whether networks see an estimate of it; no gradient passes through that.
 
     Raises:
         ValueError: If the task cannot be differentiated.
     """
 
-    def __init__(self, options: TrackingOptions, n: int, seed: int) -> None:
+    def __init__(
+        self, options: TrackingOptions, n: int, seed: int, disturbance_estimate: bool = False
+    ) -> None:
         if options.reward != "bounded":
             raise ValueError(
                 f"the analytic policy gradient needs reward='bounded', got {shown(options.reward)}"
             )
         self.batch, self.n, self.rng = TrackingBatch(options, n), n, np.random.default_rng(seed)
         self.task = self.batch.task
-        self.features: Features = default_features(self.task.layout)
-        self._encoder = Encoder(Encoding(self.features), self.task)
+        self.features: Features = training_features(options, disturbance_estimate=disturbance_estimate)
+        self._observer = Observer(Encoding(self.features), self.task, n)
         self._vector = task_vector(self.task, options.substeps, options.lost_distance)
         self._scratch = np.zeros((SCRATCH_ROWS + 4, 16))
         self._out = np.empty((n, self.task.layout.size), dtype=np.float32)
@@ -77,13 +83,14 @@ class DifferentiableFlights:
         self._cut = self.rng.integers(1, self.task.episode_steps + 1, n)
         self._told = self.batch.fresh_scores()
         self._begin(np.arange(n))
+        self._seen = self._observer.see(self._out, np.ones(n, dtype=np.bool_))
 
     def _begin(self, index: NDArray[np.int64]) -> None:
         self.batch.begin(index, [self.rng] * len(index), self._out.reshape(-1), self._told)
 
     def observe(self) -> Floats:
         """Scaled features of all flights as they are, (n, features)."""
-        return self._encoder.see(self._out)
+        return self._seen
 
     def begin_window(self, n_steps: int) -> None:
         """A window of n_steps follows; observations reach back to no earlier step."""
@@ -131,6 +138,7 @@ class DifferentiableFlights:
         )
         if done.any():
             self._begin(np.flatnonzero(done))
+        self._seen = self._observer.see(self._out, done)
         return record
 
     def advance_vjp(

@@ -19,7 +19,8 @@ from quad_envs.registration import ENTRY, TEAMS, TRACKING, VECTOR_ENTRY
 
 from ..evaluation.columns import renamed
 from ..evaluation.evaluate import fly_and_measure
-from ..policies.network import Network, NetworkPolicy
+from ..policies.network import Network
+from ..policies.network_policies import network_policy
 from ..policies.outside import import_named
 from ..policies.protocol import Policy
 
@@ -119,7 +120,7 @@ class HeldOutFlights:
 
     def judge(self, network: Network, cpu_seconds: float, progress: Progress, seed: int = CHOOSING) -> Point:
         """Fly a network, see `judge_policy`."""
-        policy = NetworkPolicy(network, self.task, "training")
+        policy = network_policy(network, self.task, "training")
         return self.judge_policy(policy, cpu_seconds, progress, seed)
 
     def judge_policy(

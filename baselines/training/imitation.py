@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quad_envs.encoding import Encoder, Encoding, hover_outputs
+from quad_envs.encoding import Encoding, hover_outputs
 from quad_envs.envs.team.options import TeamOptions
 from quad_envs.envs.team.vector import TeamVectorEnv
 from quad_envs.envs.tracking.options import TrackingOptions
@@ -23,12 +23,14 @@ from quad_envs.tasks import BaseTask, TeamTask
 
 from ..errors import TrainingError
 from ..evaluation.rollout import is_privileged
-from ..policies.network import Floats, Network, NetworkPolicy
+from ..policies.network import Floats, Network
+from ..policies.network_policies import network_policy
 from ..policies.protocol import Policy
-from ..policies.registry import make_policy
+from ..policies.registry import is_trained, make_policy, policy_options
 from .algorithm_options import DaggerOptions
 from .features import training_features
 from .held_out import Progress
+from .observer import Observer
 from .policy_gradient import Actor
 
 if TYPE_CHECKING:
@@ -47,6 +49,7 @@ class LabelledFlights:
         rows: Number of flights, or of vehicles in as many teams as that makes.
         seed: Of the starts, and of who flies.
         stages: Of the preview that the network sees; None for the usual ones.
+        disturbance_estimate: Whether it sees an estimate of the disturbance.
     """
 
     def __init__(
@@ -56,6 +59,7 @@ class LabelledFlights:
         rows: int,
         seed: int,
         stages: tuple[int, ...] | None = None,
+        disturbance_estimate: bool = False,
     ) -> None:
         self._size = options.vehicles if isinstance(options, TeamOptions) else 1
         count = max(1, rows // self._size)
@@ -65,13 +69,17 @@ class LabelledFlights:
             given = {field.name: getattr(options, field.name) for field in fields(options) if field.init}
             self.env = TrackingVectorEnv(count, **given)
         self.task: BaseTask = self.env.task
-        self.encoder = Encoder(Encoding(training_features(options, stages)), self.task)
+        encoding = Encoding(training_features(options, stages, disturbance_estimate))
+        self._observer = Observer(encoding, self.task, self.env.num_envs)
+        self.encoder = self._observer.encoder
         self.outputs = self.task.action_size if isinstance(self.task, TeamTask) else 4
         sequence = np.random.SeedSequence([_STREAM, seed])
         self._rng = np.random.default_rng(sequence)
         self._expert = expert
         self._observations, _ = self.env.reset(seed=sequence.generate_state(count, np.uint64).tolist())
-        self._state, n = None, self.env.num_envs
+        self._state: Any = None  # of the expert
+        self._flown: Any = None  # of the network
+        n = self.env.num_envs
         self._begins, self._done = np.ones(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
 
     def collect(self, network: Network, beta: float, steps: int) -> tuple[Floats, Floats, float]:
@@ -85,16 +93,15 @@ class LabelledFlights:
         Returns:
             Scaled features (m, inputs), the expert's outputs (m, outputs) and the mean reward.
         """
-        flier = NetworkPolicy(network, self.task, "learner")
+        flier = network_policy(network, self.task, "learner")
         by_expert = (self._rng.random(self.env.num_envs) < beta)[:, None]
         seen, wanted, rewards = [], [], []
         for _ in range(steps):
             labels, self._state = self._expert.predict(self._observations, self._state, self._begins)
-            actions = labels if by_expert.all() else np.where(
-                by_expert, labels, flier.predict(self._observations)[0]
-            )  # fmt: skip
+            own, self._flown = flier.predict(self._observations, self._flown, self._begins)
+            actions = np.where(by_expert, labels, own)
             flies = ~self._done  # a row that is done begins anew in this step, whatever the action
-            seen.append(self.encoder.see(self._observations[flies]))
+            seen.append(self._observer.see(self._observations, self._begins)[flies])
             wanted.append(hover_outputs(labels[flies], self.task))
             self._observations, reward, terminated, truncated, _ = self.env.step(actions)
             rewards.append(reward[flies])
@@ -127,7 +134,9 @@ class Labels:
         return torch.from_numpy(self._x[rows]), torch.from_numpy(self._y[rows])
 
 
-def make_expert(name: str, task: BaseTask, separation: float | None = None) -> Policy:
+def make_expert(
+    name: str, task: BaseTask, separation: float | None = None, reject_disturbance: bool = False
+) -> Policy:
     """The policy to imitate.
 
     Args:
@@ -135,6 +144,7 @@ def make_expert(name: str, task: BaseTask, separation: float | None = None) -> P
         task: Where it flies.
         separation: Distance that it keeps, m: what imitates it is less exact, and between the task's
             separation and a crash are 7 cm. None for the task's own.
+        reject_disturbance: Whether an MPC estimates and rejects disturbances, for who sees the estimate.
 
     Raises:
         ValueError: If it is unknown, sees more than observations, or remembers what a network cannot.
@@ -151,7 +161,9 @@ def make_expert(name: str, task: BaseTask, separation: float | None = None) -> P
                 f"hyperparameter separation is for teams, and at least their own, got {shown(separation)} m"
             )
         task = replace(task, separation=separation)
-    expert = make_policy(name or _EXPERTS[mission], task)
+    name = name or _EXPERTS[mission]
+    rejects = reject_disturbance and not is_trained(name) and "reject_disturbance" in policy_options(name)
+    expert = make_policy(name, task, **({"reject_disturbance": True} if rejects else {}))
     if is_privileged(expert):
         raise ValueError(
             f"expert {name!r} decides from the whole truth, a network from observations; choose another"
@@ -182,14 +194,16 @@ def train(
     import torch
 
     torch.manual_seed(seed)
-    expert = make_expert(options.expert, task_options.task, options.separation)
+    expert = make_expert(options.expert, task_options.task, options.separation, options.disturbance_estimate)
     if options.episode_steps is not None:
         if not isinstance(task_options, TeamOptions):
             raise ValueError(
                 f"hyperparameter episode_steps = {options.episode_steps!r} is for teams: leave it out"
             )
         task_options = replace(task_options, max_cycles=options.episode_steps)
-    flights = LabelledFlights(task_options, expert, options.n_envs, seed, options.stages)
+    flights = LabelledFlights(
+        task_options, expert, options.n_envs, seed, options.stages, options.disturbance_estimate
+    )
     features, outputs = flights.encoder.encoding.features, flights.outputs
     actor = Actor(len(features.names), options.net_arch, outputs, options.squash)
     if start is not None:

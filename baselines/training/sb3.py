@@ -130,7 +130,9 @@ def make_flights(
     stages = options.stages
     if stages is None and isinstance(task_options, TrackingOptions):
         stages = stages_of(task_options.task.layout.preview)
-    encoding = Encoding(training_features(task_options, stages), options.command_range)
+    encoding = Encoding(
+        training_features(task_options, stages, options.disturbance_estimate), options.command_range
+    )
     if start is not None:
         encoding = start.encoding
     n = max(1, options.n_envs // size)

@@ -17,7 +17,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from quad_envs.encoding import Encoder, Encoding
+from quad_envs.encoding import Encoding
 from quad_envs.envs.team.batch import TeamBatch
 from quad_envs.envs.team.options import TeamOptions
 from quad_envs.envs.tracking.batch import TrackingBatch
@@ -27,6 +27,7 @@ from quad_envs.observations.features import Features, default_features
 from quad_envs.tasks import Task, TeamTask
 
 from ..policies.network import Floats
+from .observer import Observer
 
 Bools = NDArray[np.bool_]
 TaskOptions = TrackingOptions | TeamOptions
@@ -88,8 +89,9 @@ class TrainingVecEnv(VecEnv):
                 f"actions of {self.task.env_id} are estimates, and this trains networks that command rotors: "
                 "choose quad/TargetTracking-v0 or a tracking task"
             )
-        self.encoder = Encoder(encoding or Encoding(default_features(self.task.layout)), self.task)
         rows = n * self._size
+        self._observer = Observer(encoding or Encoding(default_features(self.task.layout)), self.task, rows)
+        self.encoder = self._observer.encoder
         self._out = np.empty((rows, self.task.layout.size), dtype=np.float32)
         self._actions = np.zeros((rows, self.action_size), dtype=np.float32)
         self._n, self._staggered = n, staggered
@@ -140,7 +142,7 @@ class TrainingVecEnv(VecEnv):
             self._left[:] = self._stagger.integers(1, self._steps_of_episode + 1, self._n)
         self.costs = np.zeros(self.num_envs)
         self.violated, self.crashed = np.zeros((2, self.num_envs), dtype=np.bool_)
-        return self._scaled(self._out)
+        return self._observer.see(self._out, np.ones(self.num_envs, dtype=np.bool_))
 
     def step_async(self, actions: Floats) -> None:
         """Take the network's outputs, (rows, action size), in [-1, 1]."""
@@ -161,17 +163,18 @@ class TrainingVecEnv(VecEnv):
         self._left -= 1
         ended = (self.crashed | truncated).reshape(self._n, self._size).all(axis=1)
         ended |= self._left == 0
+        seen, dones, infos = self._observer.see(self._out), np.repeat(ended, self._size), self._infos[:]
         if not ended.any():
-            return self._scaled(self._out), rewards, np.zeros(self.num_envs, dtype=np.bool_), self._infos[:]
-        dones, infos = np.repeat(ended, self._size), self._infos[:]
-        last = self._scaled(self._out[dones])
-        for row, features in zip(np.flatnonzero(dones).tolist(), last, strict=True):
+            return seen, rewards, dones, infos
+        rows = np.flatnonzero(dones)
+        for row, features in zip(rows.tolist(), seen[rows], strict=True):
             infos[row] = {
                 "terminal_observation": features,
                 "TimeLimit.truncated": not bool(self.crashed[row]),
             }
         self._begin(np.flatnonzero(ended))
-        return self._scaled(self._out), rewards, dones, infos
+        seen[rows] = self._observer.see(self._out[rows], np.ones(len(rows), dtype=np.bool_), rows)
+        return seen, rewards, dones, infos
 
     def _step(self) -> Bools:
         """Move all rows, and take over their scores; which rows are at the end of their time."""
@@ -193,9 +196,6 @@ class TrainingVecEnv(VecEnv):
         self._left[groups] = self._steps_of_episode
         generators = [self._generators[group] for group in groups.tolist()]
         self._batch.begin(groups, generators, self._out.reshape(-1), self._told)
-
-    def _scaled(self, observations: Floats) -> Floats:
-        return self.encoder.see(observations)
 
     def close(self) -> None:
         """There is nothing to close."""

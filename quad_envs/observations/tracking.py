@@ -6,6 +6,7 @@
 | position | 3 | p, only where the task limits the position |
 | disturbance | 6 | torque (body, N m), force (inertial, N) in the middle of the period, where revealed |
 | preview | 8 (preview + 1) | p_ref - p 3, v_ref 3, sin psi_ref, cos psi_ref for k..k+preview |
+| disturbance_estimate | 6 | torque and force as they were estimated, where somebody appends them |
 """
 
 from __future__ import annotations
@@ -52,6 +53,7 @@ class TrackingLayout:
     preview: int = 25  # stages of the reference after the present one
     position: bool = False
     disturbance: bool = False
+    disturbance_estimate: bool = False  # behind the rest, where somebody estimates
 
     def __post_init__(self) -> None:
         if self.preview < 0:
@@ -73,6 +75,8 @@ class TrackingLayout:
         if self.disturbance:
             parts.append(("disturbance", 6))
         parts.append(("preview", N_REFERENCE * (self.preview + 1)))
+        if self.disturbance_estimate:
+            parts.append(("disturbance_estimate", 6))
         out, start = {"own": slice(0, N_OWN)}, 0
         for name, size in parts:
             out[name] = slice(start, start + size)
@@ -87,7 +91,7 @@ class TrackingLayout:
     @property
     def size(self) -> int:
         """Length of the observation."""
-        return self.preview_start + N_REFERENCE * (self.preview + 1)
+        return self.preview_start + N_REFERENCE * (self.preview + 1) + 6 * self.disturbance_estimate
 
     def decode(self, observation: NDArray[np.floating]) -> TrackingView:
         """Split observations into named parts.

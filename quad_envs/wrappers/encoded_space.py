@@ -57,6 +57,16 @@ def stages_of(preview: int) -> tuple[int, ...]:
     return tuple(stage for stage in STAGES if stage <= preview)
 
 
+def _task_of(env: Any) -> Any:
+    """The task of an environment, or of the outermost wrapper that has one: it adds to observations."""
+    while env is not None:
+        task = getattr(env, "task", None)
+        if task is not None:
+            return task
+        env = getattr(env, "env", None)
+    return None
+
+
 def make_encoder(env: Any, stages: tuple[int, ...] | None, command_range: float) -> Encoder:
     """The encoder of a wrapper.
 
@@ -68,7 +78,7 @@ def make_encoder(env: Any, stages: tuple[int, ...] | None, command_range: float)
     Raises:
         ValueError: If its task is none of one vehicle, or an argument is not allowed.
     """
-    task = getattr(getattr(env, "unwrapped", env), "task", None)
+    task = _task_of(env)
     if not isinstance(task, Task):
         raise ValueError(
             "FilterAndRescale wraps a tracking environment of this suite, single or vector, got one with "

@@ -1,0 +1,46 @@
+"""What a network in training sees of many rows of observations, with what its estimators remember."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_envs.encoding import Encoder, Encoding
+from quad_envs.tasks import Task, TeamTask
+
+from ..policies.disturbance_estimate import Bools, DisturbanceEstimator, Floats, sees_estimate
+
+
+class Observer:
+    """Observations to features, row by row; with the disturbance's estimate, where the network sees one.
+
+    Args:
+        encoding: What the network sees and commands.
+        task: Where observations come from.
+        n: Number of rows.
+
+    Raises:
+        ValueError: If observations lack what the network sees.
+    """
+
+    def __init__(self, encoding: Encoding, task: Task | TeamTask, n: int) -> None:
+        self._estimator = DisturbanceEstimator(task) if sees_estimate(encoding.features) else None
+        self.encoder = Encoder(encoding, task if self._estimator is None else self._estimator.task)
+        self._memory = np.zeros((n, 0 if self._estimator is None else self._estimator.memory_size))
+
+    def see(
+        self, observations: Floats, begins: Bools | None = None, rows: NDArray[np.int64] | None = None
+    ) -> Floats:
+        """Features of the next observations, (m, features); called once for each of them.
+
+        Args:
+            observations: (m, d).
+            begins: (m,), which begin an episode; None for none.
+            rows: Which rows these are, (m,); None for all.
+        """
+        if self._estimator is None:
+            return self.encoder.see(observations)
+        where = slice(None) if rows is None else rows
+        start = np.zeros(len(observations), dtype=np.bool_) if begins is None else begins
+        seen, self._memory[where] = self._estimator.extend(observations, self._memory[where], start)
+        return self.encoder.see(seen)
