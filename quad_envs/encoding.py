@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from .kinds import is_number
 from .names import shown
 from .observations.features import Features
+from .observations.heading import HeadingAxes
 from .parameters import Array
 from .tasks import BaseTask, Task, TeamTask
 
@@ -48,6 +49,7 @@ class Encoding:
             "scale": list(seen.scale),
             "clip": seen.clip,
             "command_range": self.command_range,
+            **({"heading_axes": True} if seen.heading_axes else {}),
         }
 
     @classmethod
@@ -63,6 +65,7 @@ class Encoding:
             tuple(map(float, plain["mean"])),
             tuple(map(float, plain["scale"])),
             None if clip is None else float(clip),
+            bool(plain.get("heading_axes", False)),
         )
         return cls(features, float(plain["command_range"]))
 
@@ -81,6 +84,7 @@ class Encoder:
     def __init__(self, encoding: Encoding, task: Task | TeamTask) -> None:
         self.encoding, self.task = encoding, task
         self._columns = encoding.features.columns(task.layout)
+        self._axes = HeadingAxes(task.layout) if encoding.features.heading_axes else None
         self._mean = np.asarray(encoding.features.mean, dtype=np.float32)
         self._rate = (1.0 / np.asarray(encoding.features.scale)).astype(np.float32)
         self._gains = hover_gains(task, encoding.command_range, np.float32)
@@ -92,7 +96,8 @@ class Encoder:
 
     def see(self, observations: NDArray[Any]) -> Floats:
         """Features (..., size) of observations (..., layout.size)."""
-        out: Floats = np.take(observations, self._columns, axis=-1).astype(np.float32, copy=False)
+        turned = observations if self._axes is None else self._axes.turn(observations)
+        out: Floats = np.take(turned, self._columns, axis=-1).astype(np.float32, copy=False)
         out -= self._mean
         out *= self._rate
         return out

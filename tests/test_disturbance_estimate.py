@@ -171,12 +171,12 @@ def test_every_learner_of_one_vehicle_trains_with_it_under_conditions(tmp_path, 
 
 def test_training_flights_show_networks_what_they_see_in_flight():
     pytest.importorskip("torch")
+    from baselines.training.features import training_features
     from baselines.training.flights import DifferentiableFlights
     from baselines.training.held_out import training_options
 
-    flights = DifferentiableFlights(
-        training_options(RANDOM, {"randomize": 0.2}), 6, 0, disturbance_estimate=True
-    )
+    options = training_options(RANDOM, {"randomize": 0.2})
+    flights = DifferentiableFlights(options, 6, 0, training_features(options, disturbance_estimate=True))
     flights._cut[:] = [3, 5, 7, 9, 11, 100]
     estimator = DisturbanceEstimator(flights.task)
     memory, start = np.zeros((6, estimator.memory_size)), np.ones(6, dtype=np.bool_)

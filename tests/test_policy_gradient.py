@@ -8,6 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from baselines.training.algorithm_options import PolicyGradientOptions  # noqa: E402
+from baselines.training.features import training_features  # noqa: E402
 from baselines.training.flights import DifferentiableFlights  # noqa: E402
 from baselines.training.held_out import training_options  # noqa: E402
 from baselines.training.policy_gradient import Actor, _window_gradient, train  # noqa: E402
@@ -22,10 +23,14 @@ VARIED = {
     "randomize": {"mass": 0.2, "inertia": 0.2, "arm": 0.2, "rotor_rate": 0.2, "kappa": 0.45},
 }
 
+TURNED = {"reference": {"kind": "heading", "yaw": 1.0, "rate": 0.8, "reference": "random"}}
+
 
 def begin(conditions, seed=3):
-    """Flights of which none ends within the window."""
-    flights = DifferentiableFlights(training_options(RANDOM, conditions), FLIGHTS, seed)
+    """Flights of which none ends within the window; where the heading turns, seen in its axes."""
+    options = training_options(RANDOM, conditions)
+    features = training_features(options, None, disturbance_estimate=True, heading_axes=True)
+    flights = DifferentiableFlights(options, FLIGHTS, seed, features if "reference" in conditions else None)
     flights._cut[:] = 10_000
     return flights
 
@@ -67,7 +72,7 @@ def errors_along_directions(conditions):
 
 
 @pytest.mark.parametrize(
-    "conditions", [{}, {"sensor_noise": 0.01}, VARIED], ids=["nominal", "noise", "vehicles"]
+    "conditions", [{}, {"sensor_noise": 0.01}, VARIED, TURNED], ids=["", "noise", "vehicles", "heading"]
 )
 def test_the_gradient_of_a_window_is_the_derivative_of_its_objective(conditions):
     # what is left is the second order of a step of 1e-2, and float32 in the network

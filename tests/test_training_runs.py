@@ -8,6 +8,7 @@ import shlex
 import signal
 import time
 from dataclasses import fields, replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,9 @@ from baselines.training.algorithms import ALGORITHMS, options_of
 from baselines.training.clock import Budget
 from baselines.training.held_out import CHOOSING, Point, better, training_options
 from baselines.training.hyperparameters import hyperparameter_file, hyperparameters
+from baselines.training.plans import make_plan
 from baselines.training.request import TrainingRequest
+from baselines.training.runs import limit_of
 from baselines.training.watching import Display
 from quad_envs.registration import TEAMS, TRACKING
 
@@ -238,6 +241,20 @@ def test_the_best_policy_is_under_the_limit_if_there_is_one():
     safe, bold = point._replace(score=0.4, violation_share=0.01), point._replace(score=0.6)
     assert better(bold, point) and not better(safe, point)
     assert better(safe, point, 0.05) and not better(bold, safe, 0.05) and better(bold, point, 0.05)
+    crashed = point._replace(score=0.6, violation_share=0.0, crashes=5)
+    assert better(point, crashed, 0.01) and better(safe, crashed, 0.01)
+
+
+def test_a_vehicle_with_limits_keeps_them_first_and_one_without_scores(tmp_path):
+    def limit(env_id, algorithm, **request):
+        return limit_of(make_plan(TrainingRequest(env_id, algorithm, **request)))
+
+    corridor, lagrangian = "quad/CorridorTracking-v0", {"hyper": {"limit": 0.03}}
+    assert limit(HELIX, "stub") is None and limit("quad/Formation-v0", "stub") is None
+    assert limit(corridor, "stub") == 0.01
+    assert limit(HELIX, "stub", env_kwargs={"tilt_limit": 0.3}) == 0.01
+    if find_spec("stable_baselines3"):
+        assert limit(corridor, "ppo-lagrangian", **lagrangian) == 0.03
 
 
 def test_hyperparameters_come_from_the_committed_files():

@@ -72,6 +72,7 @@ def save_checkpoint(folder: str | Path, network: Network, about: Mapping[str, An
             "mean": list(network.features.mean),
             "scale": list(network.features.scale),
             **({"clip": network.features.clip} if number >= 2 else {}),
+            **({"heading_axes": True} if network.features.heading_axes else {}),
         },
         **({"activation": network.activation} if number >= 2 else {}),
         **({"command_range": network.command_range} if number >= 3 else {}),
@@ -125,6 +126,7 @@ def load_checkpoint(folder: str | Path) -> tuple[Network, dict[str, Any]]:
                 tuple(map(float, features["mean"])),
                 tuple(map(float, features["scale"])),
                 None if features.get("clip") is None else float(features["clip"]),
+                bool(features.get("heading_axes", False)),
             ),
             weights=tuple(tensors[f"{k}.weight"] for k in range(len(tensors) // 2)),
             biases=tuple(tensors[f"{k}.bias"] for k in range(len(tensors) // 2)),
@@ -141,9 +143,10 @@ def load_checkpoint(folder: str | Path) -> tuple[Network, dict[str, Any]]:
 def _format_of(network: Network) -> int:
     """The lowest that says all of a network.
 
-    2 has relu layers and cut features, 3 a range of commands, 4 an estimate among features.
+    2 has relu layers and cut features, 3 a range of commands, 4 an estimate among
+    features, or other axes.
     """
-    if sees_estimate(network.features):
+    if sees_estimate(network.features) or network.features.heading_axes:
         return 4
     if network.command_range != 1.0:
         return 3

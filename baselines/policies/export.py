@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -209,11 +210,11 @@ def _encoded_features(encoder: Encoder, task: Any, seen: Normalisation | None) -
     if seen is None:
         return features
     mean, scale = np.asarray(features.mean), np.asarray(features.scale)
-    return Features(
-        features.names,
-        tuple((mean + scale * seen.mean).tolist()),
-        tuple((scale * seen.scale).tolist()),
-        min(seen.clip, _NO_CUT),
+    return replace(
+        features,
+        mean=tuple((mean + scale * seen.mean).tolist()),
+        scale=tuple((scale * seen.scale).tolist()),
+        clip=min(seen.clip, _NO_CUT),
     )
 
 

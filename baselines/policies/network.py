@@ -16,12 +16,13 @@ from quad_envs.compilation.decorators import entry_of
 from quad_envs.encoding import Encoding, hover_actions, hover_gains
 from quad_envs.names import shown
 from quad_envs.observations.features import Features
+from quad_envs.observations.heading import HeadingAxes
 from quad_envs.parameters import Array
 from quad_envs.tasks import BaseTask, Task, TeamTask
 
 from .network_kernels import forward_rows
 from .protocol import Actions, PolicyState
-from .rows import as_rows, as_starts, not_finite, state_of
+from .rows import as_rows, as_starts, not_finite, require_finite, state_of
 
 Floats = NDArray[np.float32]
 Squash = Literal["tanh", "clip"]
@@ -155,6 +156,7 @@ class NetworkPolicy:
         self.network, self.task, self.name, self.kind = network, task, name, kind
         self._size = task.layout.size
         self._columns = network.features.columns(task.layout)
+        self._axes = HeadingAxes(task.layout) if network.features.heading_axes else None
         self._layers = network.layers()
         self._sizes = np.array([len(self._columns), *(len(b) for _, b in self._layers)], dtype=np.int64)
         self._flat = np.concatenate([part.reshape(-1) for layer in self._layers for part in layer])
@@ -187,6 +189,9 @@ class NetworkPolicy:
         if episode_start is not None:
             as_starts(episode_start, n)
         kept = _no_state(n) if state is None else state_of(state, n, 0)
+        if self._axes is not None:
+            require_finite(obs, self.task.layout.slices)
+            obs = self._axes.turn(obs)
         actions = self._few(obs) if n <= _FEW else self._many(obs)
         return actions[0] if one else actions, kept
 
@@ -202,9 +207,7 @@ class NetworkPolicy:
 
     def _many(self, obs: Floats) -> Actions:
         """The same in numpy."""
-        finite = np.isfinite(obs)
-        if not finite.all():
-            raise not_finite(obs, int(np.argmin(finite)), self.task.layout.slices)
+        require_finite(obs, self.task.layout.slices)
         x = obs[:, self._columns]
         if len(self._scaling):
             mean, scale, clip = self._scaling

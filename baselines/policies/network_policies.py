@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_envs.tasks import BaseTask
@@ -12,7 +11,7 @@ from quad_envs.tasks import BaseTask
 from .disturbance_estimate import DisturbanceEstimator, sees_estimate
 from .network import Network, NetworkPolicy
 from .protocol import Actions, PolicyState
-from .rows import as_rows, as_starts, not_finite, state_of
+from .rows import as_rows, as_starts, require_finite, state_of
 
 
 class EstimatingPolicy:
@@ -52,9 +51,7 @@ class EstimatingPolicy:
             ValueError: If a shape is wrong or an observation is not finite; it names the part.
         """
         obs, one = as_rows(observation, self.task.layout.size)
-        finite = np.isfinite(obs)
-        if not finite.all():
-            raise not_finite(obs, int(np.argmin(finite)), self.task.layout.slices)
+        require_finite(obs, self.task.layout.slices)
         start = as_starts(episode_start, len(obs))
         kept = state_of(state, len(obs), self._estimator.memory_size)
         seen, memory = self._estimator.extend(obs, kept.memory, start)

@@ -94,3 +94,14 @@ def not_finite(obs: NDArray[Any], index: int, slices: Mapping[str, slice]) -> Va
         f"observation {row} is not finite: {where} (index {column}) is {obs[row, column]}; "
         "check the sensors or the wrapper that made it"
     )
+
+
+def require_finite(obs: NDArray[Any], slices: Mapping[str, slice]) -> None:
+    """Check observations (n, d).
+
+    Raises:
+        ValueError: If a number is not finite, see `not_finite`.
+    """
+    finite = np.isfinite(obs)
+    if not finite.all():
+        raise not_finite(obs, int(np.argmin(finite)), slices)

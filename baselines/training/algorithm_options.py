@@ -61,6 +61,7 @@ class PolicyGradientOptions:
     separation: float | None = None  # m, below which the cost counts a team's distances; None for the task's
     episode_steps: int | None = None  # of a team's flight in training; None for the task's own
     disturbance_estimate: bool = False  # whether the network sees an estimate of the disturbance
+    heading_axes: bool = False  # whether it sees in axes turned to the heading of the reference
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +82,7 @@ class DaggerOptions:
     squash: Squash = "tanh"  # how outputs come into [-1, 1]; "clip" as PPO, which can then go on from here
     stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for the usual ones
     disturbance_estimate: bool = False  # whether network and expert estimate the disturbance
+    heading_axes: bool = False  # whether the network sees in axes turned to the heading of the reference
     separation: float | None = None  # m, that the expert of a team keeps; None for the task's own
     episode_steps: int | None = None  # of a team's flight in training; None for the task's own
 
@@ -105,6 +107,7 @@ class PpoOptions:
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers, of policy and critic alike
     stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for FilterAndRescale's
     disturbance_estimate: bool = False  # whether the network sees an estimate of the disturbance
+    heading_axes: bool = False  # whether it sees in axes turned to the heading of the reference
     command_range: float = 0.5  # largest change of a rotor force, as a share of its force in hover
     episode_steps: int | None = None  # of a flight in training; None for the task's own
     critic_updates: int = 5  # of the critic alone, where training goes on from a policy
@@ -142,6 +145,7 @@ class SacOptions:
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers, of policy and critics alike
     stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for FilterAndRescale's
     disturbance_estimate: bool = False  # whether the network sees an estimate of the disturbance
+    heading_axes: bool = False  # whether it sees in axes turned to the heading of the reference
     command_range: float = 0.5  # largest change of a rotor force, as a share of its force in hover
     episode_steps: int | None = None  # of a flight in training; None for the task's own
     progress_steps: int = 64  # of each flight between two looks at the policy

@@ -15,6 +15,7 @@ def training_features(
     options: TrackingOptions | TeamOptions,
     stages: tuple[int, ...] | None = None,
     disturbance_estimate: bool = False,
+    heading_axes: bool = False,
 ) -> Features:
     """The default features without comm slots that nobody fills in this task's graphs.
 
@@ -22,9 +23,10 @@ def training_features(
         options: Of the task.
         stages: Preview stages to keep; None for the usual ones.
         disturbance_estimate: Whether the network sees an estimate of the disturbance, too.
+        heading_axes: Whether it sees in axes turned to the heading of the reference.
 
     Raises:
-        ValueError: If the preview has not these stages, or the estimate is asked for in a team.
+        ValueError: If the preview has not these stages, or what is for one vehicle is asked for in a team.
     """
     layout = options.task.layout
     if stages is not None and not set(stages) <= set(range(layout.preview + 1)):
@@ -33,9 +35,8 @@ def training_features(
         )
     if not isinstance(options, TeamOptions):
         own = replace(options.task.layout, disturbance_estimate=disturbance_estimate)
-        return default_features(own, stages)
-    if disturbance_estimate:
-        raise ValueError(estimate_in_team(options))
+        return replace(default_features(own, stages), heading_axes=heading_axes)
+    require_plain(options, disturbance_estimate, heading_axes)
     features = default_features(layout, stages)
     used = in_neighbours(options.graphs.graphs).shape[1]
     empty = tuple(
@@ -54,9 +55,14 @@ def training_features(
     )
 
 
-def estimate_in_team(options: TeamOptions) -> str:
-    """What to say where the estimate is asked for in a team."""
-    return (
-        f"hyperparameter disturbance_estimate is for one vehicle, and {options.env_id} has several: "
-        "leave it out"
-    )
+def require_plain(options: TeamOptions, disturbance_estimate: bool, heading_axes: bool) -> None:
+    """Refuse in a team what is for one vehicle.
+
+    Raises:
+        ValueError: If one of them is asked for.
+    """
+    for name, asked in (("disturbance_estimate", disturbance_estimate), ("heading_axes", heading_axes)):
+        if asked:
+            raise ValueError(
+                f"hyperparameter {name} is for one vehicle, and {options.env_id} has several: leave it out"
+            )

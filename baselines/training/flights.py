@@ -33,6 +33,7 @@ from .observer import Observer
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float32]
 _YAW = slice(5, 7)  # sine and cosine of it in an observation
+_HEADING = 6  # likewise of the reference in a stage of the preview
 
 
 class Record(NamedTuple):
@@ -49,7 +50,8 @@ class Record(NamedTuple):
     slopes: Array  # (n, 4), of the commands by the actions
     rewards: Array  # (n,)
     done: Bools  # (n,), flights that began anew
-    yaw: Floats  # (n, 2), sine and cosine of it as the observation before had them
+    axes: Floats  # (n, 2), sine and cosine of the angle by which the observation before was turned
+    yaw: Floats  # (n, 2), of the yaw in it
 
 
 class DifferentiableFlights:
@@ -59,22 +61,21 @@ class DifferentiableFlights:
         options: Of the task; its reward must be the bounded one.
         n: Number of flights.
         seed: Of the starts.
-        disturbance_estimate: Whether networks see an estimate of it; no gradient passes through that.
+        features: That a network sees: the default ones of `training_features`, with what it may add to them.
+            No gradient passes through an estimate of the disturbance.
 
     Raises:
         ValueError: If the task cannot be differentiated.
     """
 
-    def __init__(
-        self, options: TrackingOptions, n: int, seed: int, disturbance_estimate: bool = False
-    ) -> None:
+    def __init__(self, options: TrackingOptions, n: int, seed: int, features: Features | None = None) -> None:
         if options.reward != "bounded":
             raise ValueError(
                 f"the analytic policy gradient needs reward='bounded', got {shown(options.reward)}"
             )
         self.batch, self.n, self.rng = TrackingBatch(options, n), n, np.random.default_rng(seed)
         self.task = self.batch.task
-        self.features: Features = training_features(options, disturbance_estimate=disturbance_estimate)
+        self.features = training_features(options) if features is None else features
         self._observer = Observer(Encoding(self.features), self.task, n)
         self._vector = task_vector(self.task, options.substeps, options.lost_distance)
         self._scratch = np.zeros((SCRATCH_ROWS + 4, 16))
@@ -107,14 +108,30 @@ class DifferentiableFlights:
         start = layout.preview_start
         stages = preview_stages(layout.preview)
         preview = full[:, start : start + N_REFERENCE * len(stages)].reshape(self.n, -1, N_REFERENCE)
-        out[:, :3] -= preview[:, :, :3].sum(axis=1)
+        x, y, z = preview[:, :, :3].sum(axis=1).T
+        sine, cosine = record.axes.T
+        out[:, :3] -= np.stack([cosine * x - sine * y, sine * x + cosine * y, z], axis=1)
         return out, full[:, 14:18]
+
+    def _axes_and_yaw(self) -> tuple[Floats, Floats]:
+        """Sines and cosines of what turns observations as they are, and of the yaw in them, (n, 2) each."""
+        sine, cosine = self._out[:, _YAW].T
+        start = self.task.layout.preview_start + _HEADING
+        axes = (
+            self._out[:, start : start + 2].copy()
+            if self.features.heading_axes
+            else np.zeros((self.n, 2), np.float32)
+        )
+        if not self.features.heading_axes:
+            axes[:, 1] = 1.0
+        s, c = axes.T
+        return axes, np.stack([sine * c - cosine * s, cosine * c + sine * s], axis=1)
 
     def advance(self, actions: Floats) -> Record:
         """One step of all flights; those that end begin anew."""
         vehicles, references = self.batch.vehicles, self.batch.references
         plants, previous = vehicles.read(PLANT, N_PLANT), vehicles.read(COMMAND, N_INPUT)
-        yaw = self._out[:, _YAW].copy()
+        axes, yaw = self._axes_and_yaw()
         self.batch.step(np.ascontiguousarray(actions).reshape(-1), self._out.reshape(-1), self._told)
         scores = scores_of(self._told.copy())
         slopes = np.empty((self.n, 4))
@@ -134,6 +151,7 @@ class DifferentiableFlights:
             slopes=slopes,
             rewards=scores.reward,
             done=done,
+            axes=axes,
             yaw=yaw,
         )
         if done.any():

@@ -150,11 +150,16 @@ class HeldOutFlights:
 
 
 def better(point: Point, best: Point | None, limit: float | None = None) -> bool:
-    """Whether a policy is better: the higher score, among those under the limit of violating steps if any."""
+    """Whether a policy is better: the higher score, among those under the limit of violating steps if any.
+
+    A flight that crashed counts as one that violated throughout: it has fewer steps to violate in.
+    """
     if best is None:
         return True
     if limit is not None:
-        over, over_best = max(0.0, point.violation_share - limit), max(0.0, best.violation_share - limit)
+        over, over_best = (
+            max(0.0, one.violation_share + one.crashes / one.flights - limit) for one in (point, best)
+        )
         if over != over_best:
             return over < over_best
     return point.score > best.score

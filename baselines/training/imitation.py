@@ -50,6 +50,7 @@ class LabelledFlights:
         seed: Of the starts, and of who flies.
         stages: Of the preview that the network sees; None for the usual ones.
         disturbance_estimate: Whether it sees an estimate of the disturbance.
+        heading_axes: Whether it sees in axes turned to the heading of the reference.
     """
 
     def __init__(
@@ -60,6 +61,7 @@ class LabelledFlights:
         seed: int,
         stages: tuple[int, ...] | None = None,
         disturbance_estimate: bool = False,
+        heading_axes: bool = False,
     ) -> None:
         self._size = options.vehicles if isinstance(options, TeamOptions) else 1
         count = max(1, rows // self._size)
@@ -69,7 +71,7 @@ class LabelledFlights:
             given = {field.name: getattr(options, field.name) for field in fields(options) if field.init}
             self.env = TrackingVectorEnv(count, **given)
         self.task: BaseTask = self.env.task
-        encoding = Encoding(training_features(options, stages, disturbance_estimate))
+        encoding = Encoding(training_features(options, stages, disturbance_estimate, heading_axes))
         self._observer = Observer(encoding, self.task, self.env.num_envs)
         self.encoder = self._observer.encoder
         self.outputs = self.task.action_size if isinstance(self.task, TeamTask) else 4
@@ -202,7 +204,13 @@ def train(
             )
         task_options = replace(task_options, max_cycles=options.episode_steps)
     flights = LabelledFlights(
-        task_options, expert, options.n_envs, seed, options.stages, options.disturbance_estimate
+        task_options,
+        expert,
+        options.n_envs,
+        seed,
+        options.stages,
+        options.disturbance_estimate,
+        options.heading_axes,
     )
     features, outputs = flights.encoder.encoding.features, flights.outputs
     actor = Actor(len(features.names), options.net_arch, outputs, options.squash)

@@ -25,7 +25,7 @@ from ..errors import TrainingError
 from ..policies.network import Floats, Network, Squash
 from .algorithm_options import PolicyGradientOptions
 from .differentiable import Flights, S
-from .features import estimate_in_team
+from .features import require_plain, training_features
 from .flights import DifferentiableFlights
 from .held_out import Progress
 from .team_flights import DifferentiableTeams
@@ -141,8 +141,7 @@ def _flights_of(
         ValueError: If the task cannot be differentiated, or a hyperparameter is for the other kind of task.
     """
     if isinstance(task_options, TeamOptions):
-        if options.disturbance_estimate:
-            raise ValueError(estimate_in_team(task_options))
+        require_plain(task_options, options.disturbance_estimate, options.heading_axes)
         cycles = options.episode_steps or task_options.task.episode_steps
         trained = replace(
             task_options,
@@ -155,7 +154,8 @@ def _flights_of(
         if getattr(options, name) is not None:
             raise ValueError(f"hyperparameter {name} = {getattr(options, name)!r} is for teams: leave it out")
     flown = replace(task_options, substeps=options.substeps)
-    return DifferentiableFlights(flown, options.n_envs, seed, options.disturbance_estimate)
+    features = training_features(flown, None, options.disturbance_estimate, options.heading_axes)
+    return DifferentiableFlights(flown, options.n_envs, seed, features)
 
 
 def train(

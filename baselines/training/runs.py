@@ -28,6 +28,7 @@ from .watching import Watcher, tensorboard_log
 
 _EVALUATIONS = 30  # in a budget
 _PAUSE = 0.5  # CPU-seconds between evaluations, at least, in a budget of seconds
+_KEPT = 0.01  # share of violating steps of one vehicle with limits, that counts as keeping them
 _LIMIT = "limit"  # hyperparameter that bounds the share of violating steps
 
 
@@ -109,7 +110,7 @@ class _Run:
         self, folder: RunFolder, plan: Plan, held_out: HeldOutFlights, start: Start, watcher: Watcher | None
     ) -> None:
         self.folder, self.plan, self.budget, self.held_out = folder, plan, plan.budget, held_out
-        self.start, self.limit = start, getattr(plan.options, _LIMIT, None)
+        self.start, self.limit = start, limit_of(plan)
         self.curve: list[Point] = list(start.curve)
         self.best = start.best
         self.clock = TrainingClock(start.seconds)
@@ -238,6 +239,18 @@ class _Run:
         if self.network is not None:
             kept = f"the best policy before and the last finite one are kept in {str(self.folder.path)!r}"
         return f"training stopped at update {self.progress.update + 1}: {why}; {kept}"
+
+
+def limit_of(plan: Plan) -> float | None:
+    """Share of violating steps under which the best policy is chosen by its score; None: by its score alone.
+
+    A vehicle with limits keeps them first, whatever the algorithm: more score by more violations is no better
+    policy. Who trains for another share says so by its hyperparameter.
+    """
+    asked: float | None = getattr(plan.options, _LIMIT, None)
+    task = plan.task_options.task
+    kept = task.mission == "tracking" and task.constraint_names
+    return _KEPT if asked is None and kept else asked
 
 
 @contextmanager

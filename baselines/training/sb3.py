@@ -131,7 +131,8 @@ def make_flights(
     if stages is None and isinstance(task_options, TrackingOptions):
         stages = stages_of(task_options.task.layout.preview)
     encoding = Encoding(
-        training_features(task_options, stages, options.disturbance_estimate), options.command_range
+        training_features(task_options, stages, options.disturbance_estimate, options.heading_axes),
+        options.command_range,
     )
     if start is not None:
         encoding = start.encoding

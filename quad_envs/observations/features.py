@@ -48,6 +48,7 @@ class Features:
     mean: tuple[float, ...]
     scale: tuple[float, ...]
     clip: float | None = None  # largest size of what is scaled, as VecNormalize cuts it; None for none
+    heading_axes: bool = False  # whether they are of the observation in `heading.HeadingAxes`
 
     def columns(self, layout: TrackingLayout | AgentLayout) -> NDArray[np.int64]:
         """Indices in an observation of this layout.

@@ -24,6 +24,8 @@ from .trajectories import (
 
 _WEIGHT = Bound(0.0, 1e6, "-", "only their ratios count")
 _OFFSET = Bound(0.0, 1e3, "m", "a vehicle that starts farther away is lost")
+_SHARE = Bound(0.0, 1.0)
+_TURNING = 0.4  # rad/s, fastest heading
 _Draw = Callable[[float, float], float]  # uniform between two numbers
 
 
@@ -48,6 +50,14 @@ def _some_lemniscate(draw: _Draw) -> Lemniscate:
     )
 
 
+def _some_smooth(draw: _Draw) -> RandomSmooth:
+    """The faster, the smaller, so that speeds stay."""
+    pace = draw(0.6, 1.4)
+    return RandomSmooth(
+        amplitude=(3.0 / pace, 3.0 / pace, 1.5 / pace), rate_min=0.2 * pace, rate_max=1.2 * pace
+    )
+
+
 # Of each family a draw of its parameters, around those of the suite's own trajectories.
 _FAMILIES: dict[str, Callable[[_Draw], Reference]] = {
     "setpoint": lambda draw: SetPoint(),
@@ -55,7 +65,7 @@ _FAMILIES: dict[str, Callable[[_Draw], Reference]] = {
     "spiral": _some_spiral,
     "lines": _some_lines,
     "lemniscate": _some_lemniscate,
-    "smooth": lambda draw: RandomSmooth(),
+    "smooth": _some_smooth,
 }
 
 
@@ -63,9 +73,10 @@ _FAMILIES: dict[str, Callable[[_Draw], Reference]] = {
 class Mixture:
     """In every episode a trajectory of another family, with random parameters, turned and displaced.
 
-    The fields are the weights of the families: `Mixture(helix=1, smooth=3)` changes two of them, 0 leaves a
-    family out. Speeds reach 4.5 m/s. What is drawn is turned about the vertical by any angle; the heading
-    stays 0. It starts at a random point near the origin, a spiral on its sphere.
+    The first fields are the weights of the families: `Mixture(helix=1, smooth=3)` changes two of them, 0
+    leaves a family out. Speeds reach 4.5 m/s. What is drawn is turned about the vertical by any angle, and
+    starts at a random point near the origin, a spiral on its sphere. The heading begins at 0 and stays there,
+    or turns.
 
     Raises:
         ValueError: If a weight is negative, all are zero, or the offset is not allowed.
@@ -78,12 +89,14 @@ class Mixture:
     lemniscate: float = 1.0  # of lemniscates, up to 1.2 times as fast as that of the suite
     smooth: float = 2.0  # of sums of sines, `RandomSmooth`
     offset: float = 2.0  # m, largest displacement along each axis; small ones are more frequent
+    turning: float = 0.25  # share of the episodes in which the heading turns, at up to 0.4 rad/s
     random: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         for name in _FAMILIES:
             require_number(f"the weight {name!r} of a mixture", getattr(self, name), _WEIGHT)
         require_number("the offset of a mixture", self.offset, _OFFSET)
+        require_number("the share of turning headings of a mixture", self.turning, _SHARE)
         if not any(self._weights()):
             raise ValueError(
                 f"a mixture needs a family with a weight > 0, got 0 for all of {', '.join(_FAMILIES)}"
@@ -103,7 +116,8 @@ class Mixture:
         reference = self.drawn(rng)
         angle, share = rng.uniform(-np.pi, np.pi), rng.random()
         offset = share * self.offset * rng.uniform(-1.0, 1.0, 3)
+        heading = rng.uniform(-_TURNING, _TURNING) if rng.random() < self.turning else 0.0
         rows = reference.rows(t, rng)
         c, s = math.cos(angle), math.sin(angle)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        return pack_rows(rows[:, :3] @ turn.T + offset, rows[:, 3:6] @ turn.T)
+        return pack_rows(rows[:, :3] @ turn.T + offset, rows[:, 3:6] @ turn.T, heading * t)
