@@ -82,9 +82,9 @@ def test_the_worst_vehicle_is_told_as_a_column_of_the_same_unit():
 
 
 def test_a_results_folder_that_says_cost_is_read(folder, capsys):
-    before = read_run(folder).environments()[0][1]
+    before = read_run(folder).environments()[0].results
     make_old(folder)
-    after = read_run(folder).environments()[0][1]
+    after = read_run(folder).environments()[0].results
     for old, new in zip(before.summary(), after.summary(), strict=True):
         assert old["quadratic_cost"] == new["quadratic_cost"] and old["effort"] == new["effort"]
         assert old["quadratic_cost_minus_base"] == new["quadratic_cost_minus_base"]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
+import subprocess
 from importlib import resources
 
 import numpy as np
@@ -69,7 +71,9 @@ def show(browser, folder):
     """Opens a page file; at the end nothing was complained of and nothing was asked for."""
     trouble, asked, contexts = [], [], []
 
-    def opened(path=folder / "report.html", width=1440, height=1000, **settings):
+    def opened(path=folder / "report.html", width=1440, height=1000, still=True, **settings):
+        if still:
+            settings["reduced_motion"] = "reduce"
         context = browser.new_context(viewport={"width": width, "height": height}, **settings)
         contexts.append(context)
         page = context.new_page()
@@ -80,6 +84,10 @@ def show(browser, folder):
         page.on("request", lambda request: asked.append(request.url))
         page.goto(path.as_uri())
         page.wait_for_selector(".plot")
+        if still:  # the whole flight from its beginning, and not the moment on which a page opens
+            page.locator("#reset").click()
+            page.keyboard.press("Home")
+            page.evaluate("document.activeElement.blur()")
         return page
 
     yield opened
@@ -119,6 +127,122 @@ def until(page, condition):
 
 def clock(page):
     return float(page.locator("#clock").inner_text().split("/")[0])
+
+
+def boxes(page, selector):
+    return [one.bounding_box() for one in page.locator(selector).all()]
+
+
+def test_the_page_opens_on_the_answer_then_the_flight_then_six_columns_then_the_rest(show):
+    page = show()
+    assert "leads with a score of" in page.locator("#answer").inner_text()
+    tops = [boxes(page, name)[0]["y"] for name in ("#answer", "#panes", "#board", "#more", "#run")]
+    assert tops == sorted(tops) and tops[1] < 1000
+    columns = page.locator("#board thead th").count()
+    assert columns <= 1 + 6 < page.locator("#board-more thead th").count()
+    for key in ("score", "score_minus_base", "violation_share", "crashed", "decision_p50_ms"):
+        assert page.locator(f'#board th[data-key="{key}"]').count() == 1
+
+
+def test_the_flight_plays_around_the_moment_of_the_largest_difference_until_one_chooses_a_time(show):
+    page = show(still=False)
+    assert page.get_by_label("View").input_value() == "reference"
+    assert page.locator("#play").get_attribute("aria-label") == "Pause"
+    begin, seen = clock(page), set()
+    for _ in range(40):
+        page.wait_for_timeout(100)
+        seen.add(clock(page))
+    assert len(seen) > 5 and max(seen) - min([begin, *seen]) < 2.7  # 1.5 s before to 1 s after
+    page.locator("#scrub").fill("0")
+    page.locator("#play").click()
+    page.keyboard.press("End")
+    assert clock(page) > max(seen)
+    page.locator("#reset").click()
+    assert page.get_by_label("View").input_value() == ""
+
+
+def test_who_wants_no_motion_sees_the_moment_at_rest(show):
+    page = show(still=False, reduced_motion="reduce")
+    assert page.locator("#play").get_attribute("aria-label") == "Play"
+    before = clock(page)
+    page.wait_for_timeout(300)
+    assert clock(page) == before > 0.0
+
+
+def test_three_policies_side_by_side_are_all_seen_at_once(show):
+    page = show(height=900)
+    page.locator(".chips button[aria-pressed=false]").click()
+    page.get_by_role("button", name="Side by side").click()
+    until(page, "document.querySelectorAll('#panes canvas').length === 3")
+    page.locator("#panes").scroll_into_view_if_needed()
+    found = boxes(page, "#panes canvas")
+    assert len(found) == 3 and found[-1]["y"] + found[-1]["height"] - found[0]["y"] < 700
+    for k in (1, 2, 3):
+        assert ink(page, f".pane:nth-child({k}) canvas")[0] > 500
+
+
+def test_readouts_have_the_decimals_of_their_unit(show):
+    page = show()
+    page.locator("#scrub").fill("3")
+    readouts = page.locator(".plot .readout").all_inner_texts()
+    assert re.fullmatch(r"(\d+\.\d{3}\s*)+", readouts[0])  # m
+    assert re.fullmatch(r"(\u2212?\d+\.\d{2}\s*)+", readouts[1])  # N
+    assert re.fullmatch(r"(\u2212?\d+\.\d\s*)+", readouts[2])  # degrees
+
+
+def test_a_flight_far_off_leaves_the_axis_and_does_not_flatten_the_others(show):
+    page = show()
+    page.locator("#environments button", has_text="HelixTracking").click()
+    page.get_by_role("button", name=EVIL).click()
+    until(page, "document.querySelectorAll('.chips button[aria-pressed=true]').length !== 2")
+    if page.locator(".chips button[aria-pressed=true]").count() == 1:
+        page.get_by_role("button", name=EVIL).click()
+    until(page, "document.querySelector('.plot h3 small').textContent.includes('leaves the axis')")
+    assert EVIL in page.locator(".plot h3 small").first.inner_text()
+
+
+def test_the_ground_lies_below_the_lowest_point_that_is_flown():
+    source = "".join(
+        resources.files("baselines.report").joinpath("page", name).read_text("utf-8")
+        for name in ("camera.js", "scene.js")
+    )
+    code = f"""{source}
+    const task = {{ limits: {{ position_lower: [null, null, null], position_upper: [null, null, null] }} }};
+    const rows = (z) => [[0, 0], [0, 0], z].map((values) => Float32Array.from(values));
+    const flight = {{ tables: {{ p: [rows([0, 7])], reference: [rows([0, 1])] }}, lengths: [1] }};
+    const scene = new Scene(null, null, {{ task }});
+    scene.show([{{ flight }}], extent([flight], task));
+    console.log(scene.floor);"""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("needs node")
+    said = subprocess.run([node, "-e", code], capture_output=True, text=True, check=True)
+    assert float(said.stdout) > 7.0
+
+
+def test_the_frontier_shows_the_family_of_an_mpc_and_who_is_near_it(show, folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "run")
+    names = "table env condition policy kind trace base score score_low score_high quadratic_cost crashed"
+    rows = [
+        f",{HELIX},,{name},{kind},{trace},lqr,{score},{low},{high},{cost},0"
+        for name, kind, trace, score, low, high, cost in (
+            ("floor 1", "controller", "by floor", 0.80, "", "", 260),
+            ("floor 0.1", "controller", "by floor", 0.84, "", "", 320),
+            ("lqr", "controller", "", 0.79, 0.78, 0.80, 270),
+            ("ppo", "model-free", "", 0.81, 0.80, 0.82, 330),
+            ("lost", "model-free", "", 0.01, 0.01, 0.01, ""),
+        )
+    ]
+    (copy / "contenders.csv").write_text("\n".join([names.replace(" ", ","), *rows, ""]))
+    path = tmp_path / "page.html"
+    path.write_text(render_report(read_run(copy)), "utf-8")
+    page = show(path)
+    assert not page.locator("#frontier").is_visible()
+    page.locator("#environments button", has_text="HelixTracking").click()
+    assert page.locator(".frontier .step").count() == 2 and page.locator(".frontier .point").count() == 2
+    assert page.locator(".frontier .name").all_text_contents() == ["ppo", "lqr"]
+    assert "lost" in page.locator("#frontier .legend").inner_text()
+    assert page.locator("#board tbody tr").count() == 3  # points of the family stand in the picture alone
 
 
 def test_the_first_environment_is_shown_with_two_policies_in_space_and_time(show):
@@ -233,11 +357,12 @@ def test_up_in_the_world_is_up_on_the_screen_and_nothing_is_mirrored(show):
 
 def test_the_leaderboard_sorts_by_click_and_by_keyboard(show):
     page = show()
-    column = page.locator('th[data-key="effort"]')
-    index = page.locator("#board thead th").all_inner_texts().index(column.inner_text())
+    page.locator("#more summary").click()
+    column = page.locator('#board-more th[data-key="effort"]')
+    index = page.locator("#board-more thead th").all_inner_texts().index(column.inner_text())
 
     def values():
-        cells = page.locator(f"#board tbody tr > :nth-child({index + 1})").all_inner_texts()
+        cells = page.locator(f"#board-more tbody tr > :nth-child({index + 1})").all_inner_texts()
         return [float(cell.split("±")[0]) for cell in cells]
 
     column.locator("button").click()
@@ -246,7 +371,7 @@ def test_the_leaderboard_sorts_by_click_and_by_keyboard(show):
     page.keyboard.press("Enter")
     assert column.get_attribute("aria-sort") == "descending"
     assert values() == sorted(values(), reverse=True)
-    assert page.locator('th[data-key="score"]').get_attribute("aria-sort") is None
+    assert page.locator('#board-more th[data-key="score"]').get_attribute("aria-sort") is None
 
 
 def test_policies_are_overlaid_or_stand_side_by_side_and_turn_together(show):
@@ -299,7 +424,9 @@ def test_the_page_is_dark_or_light_as_the_system_and_as_the_button_says(show):
 def test_a_phone_sees_the_whole_width_and_only_the_table_scrolls(show):
     page = show(width=390, height=844, has_touch=True, is_mobile=True)
     assert page.evaluate("document.documentElement.scrollWidth") == 390
-    assert page.evaluate("document.getElementById('board').scrollWidth") > 390
+    page.locator("#more summary").click()
+    assert page.evaluate("document.documentElement.scrollWidth") == 390
+    assert page.evaluate("document.getElementById('board-more').scrollWidth") > 390
     small = page.evaluate(
         "[...document.querySelectorAll('.transport button, .chips button, .choices select')]"
         ".filter((part) => part.offsetParent && part.getBoundingClientRect().height < 32).length"
@@ -331,13 +458,14 @@ def test_contenders_have_a_table_of_their_own(show, folder, tmp_path):
     path = tmp_path / "page.html"
     path.write_text(render_report(read_run(copy)), "utf-8")
     page = show(path)
-    assert not page.locator("#contenders").is_visible()
+    assert not page.locator("#policies").is_visible()
     page.locator("#environments button", has_text="HelixTracking").click()
-    text = page.locator("#contenders-board tbody").inner_text()
+    text = page.locator("#board tbody").inner_text()
+    assert page.locator("#policies").is_visible()
     assert (
         "NaN" not in text
         and text.startswith("ppo (model-free)")
-        and "▲ +0.200[0.150, 0.250]" in text
+        and "▲ +0.20[0.15, 0.25]" in text
         and "base" in text
     )
 

@@ -274,10 +274,10 @@ def test_single_vehicles_have_no_team_columns():
 
 def test_vehicles_are_averaged_within_a_flight_before_the_interval():
     records = [
-        record for seed in range(4) for record in team({"score": [0.5 + 0.1 * seed, 0.1 * seed]}, seed)
+        record for seed in range(5) for record in team({"score": [0.5 + 0.1 * seed, 0.1 * seed]}, seed)
     ]
-    assert summarize(records)["score"] == pytest.approx(estimate([0.25, 0.35, 0.45, 0.55]))
-    assert summarize(records)["score"].n == 4
+    assert summarize(records)["score"] == pytest.approx(estimate([0.25, 0.35, 0.45, 0.55, 0.65]))
+    assert summarize(records)["score"].n == 5
 
 
 def test_of_distances_the_least_of_settling_times_the_largest_vehicle_counts():
@@ -289,10 +289,10 @@ def test_of_distances_the_least_of_settling_times_the_largest_vehicle_counts():
 
 
 def test_differences_between_policies_are_over_flights():
-    ours = [record for seed in range(3) for record in team({"formation_rms": [1.0, 2.0]}, seed)]
-    theirs = [record for seed in range(3) for record in team({"formation_rms": [1.0, 1.0]}, seed)]
-    assert paired_difference(ours, theirs, "formation_rms") == (0.5, 0.0, 3)
-    assert paired_difference(ours, theirs, "formation_rms_worst") == (1.0, 0.0, 3)
+    ours = [record for seed in range(5) for record in team({"formation_rms": [1.0, 2.0]}, seed)]
+    theirs = [record for seed in range(5) for record in team({"formation_rms": [1.0, 1.0]}, seed)]
+    assert paired_difference(ours, theirs, "formation_rms") == (0.5, 0.0, 5)
+    assert paired_difference(ours, theirs, "formation_rms_worst") == (1.0, 0.0, 5)
 
 
 def test_a_flight_in_which_all_crash_is_one_crash():

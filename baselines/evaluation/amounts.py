@@ -1,4 +1,4 @@
-"""Checks of how much is flown, and by how many at once."""
+"""How much is flown, and by how many at once: what is allowed, and from when on intervals mean something."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 from quad_envs.checks import require_memory, require_whole
 
 MOST_EPISODES = 100_000
+INTERVAL_LEAST = 5  # flights, below which no interval is said
 _EPISODE_BYTES = 4000  # a record, and two float32 decision times of 200 steps
 _MOST_JOBS = 1024
 _JOB_BYTES = 200_000_000  # an interpreter with its compiled kernels

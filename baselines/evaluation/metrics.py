@@ -21,6 +21,7 @@ from quad_envs.constraints import TOLERANCE
 from quad_envs.parameters import POSITION, Array
 from quad_envs.tasks import TeamTask
 
+from .amounts import INTERVAL_LEAST
 from .column import COUNTED, CUT_SHORT, FALLBACK, REPORTED
 from .columns import COLUMNS, Record, averaged, renamed, without_cut_short
 from .episode import Episode
@@ -126,7 +127,7 @@ def decision_quantiles(seconds: Array) -> tuple[float, float, float]:
 
 
 class Estimate(NamedTuple):
-    """A mean with its 95 % interval mean +- half_width (Student's t); nan where there are too few values."""
+    """A mean with its 95 % interval mean +- half_width (Student's t); nan below INTERVAL_LEAST values."""
 
     mean: float
     half_width: float
@@ -143,8 +144,8 @@ def estimate(values: Iterable[float]) -> Estimate:
     x = np.array([value for value in values if np.isfinite(value)], dtype=np.float64)
     if x.size == 0:
         return _NO_ESTIMATE
-    if x.size == 1:
-        return Estimate(float(x[0]), float("nan"), 1)
+    if x.size < INTERVAL_LEAST:
+        return Estimate(float(x.mean()), float("nan"), x.size)
     t = float(stdtrit(x.size - 1, 0.975))
     return Estimate(float(x.mean()), t * float(x.std(ddof=1)) / float(np.sqrt(x.size)), x.size)
 

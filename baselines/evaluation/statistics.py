@@ -9,6 +9,7 @@ the starts paired.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -16,12 +17,14 @@ import numpy as np
 
 from quad_envs.parameters import Array
 
+from .amounts import INTERVAL_LEAST
+
 RESAMPLES = 2_000
 _COVERED = (2.5, 97.5)  # percentiles of the resamples
 
 
 class Interval(NamedTuple):
-    """A statistic with its 95 % bootstrap interval."""
+    """A statistic with its 95 % bootstrap interval, nan below INTERVAL_LEAST starts."""
 
     value: float
     low: float
@@ -70,9 +73,36 @@ def compare(
     for x, y in zip(ours, theirs, strict=True):
         exact.add(x[None], y[None])
         drawn.add(*_resample(x, y, resamples, rng))
+    few = any(x.shape[1] < INTERVAL_LEAST for x in ours)
     return Comparison(
-        *(Interval(float(one[0]), *_range(many)) for one, many in zip(exact(), drawn(), strict=True))
+        *(
+            Interval(float(one[0]), *((math.nan,) * 2 if few else _range(many)))
+            for one, many in zip(exact(), drawn(), strict=True)
+        )
     )
+
+
+def difference(
+    ours: Sequence[Array], theirs: Sequence[Array], resamples: int = RESAMPLES, seed: int = 0
+) -> Interval:
+    """The mean of ours - theirs alone, see `compare`; the interval is nan below INTERVAL_LEAST starts."""
+    _check(ours, theirs)
+    rng = np.random.default_rng(seed)
+    value = float(np.mean([x.mean() - y.mean() for x, y in zip(ours, theirs, strict=True)]))
+    if any(x.shape[1] < INTERVAL_LEAST for x in ours):
+        return Interval(value, math.nan, math.nan)
+    drawn = [_resample(x, y, resamples, rng) for x, y in zip(ours, theirs, strict=True)]
+    means = np.mean([x.mean(axis=(1, 2)) - y.mean(axis=(1, 2)) for x, y in drawn], axis=0)
+    return Interval(value, *_range(means))
+
+
+def mean_interval(values: Array, resamples: int = RESAMPLES, seed: int = 0) -> Interval:
+    """The mean over training seeds and starts (S, E), both resampled; nan where a value is not finite."""
+    value = float(values.mean())
+    if values.shape[1] < INTERVAL_LEAST or not math.isfinite(value):
+        return Interval(value, math.nan, math.nan)
+    drawn, _ = _resample(values, values[:1], resamples, np.random.default_rng(seed))
+    return Interval(value, *_range(drawn.mean(axis=(1, 2))))
 
 
 class _Pieces:

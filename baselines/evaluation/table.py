@@ -97,6 +97,6 @@ def _cell(row: Mapping[str, Any], column: Column) -> str:
     if column.has(COUNTED):
         return str(value)
     text = format_number(column.factor * value)
-    if low not in row or not math.isfinite(value):
+    if low not in row or not math.isfinite(row[low]):
         return text
     return f"{text} [{format_number(row[low], 3)}, {format_number(row[f'{column.name}_high'], 3)}]"

@@ -11,9 +11,12 @@ from baselines.errors import ResultsError
 from baselines.evaluation.evaluate import NO_SPANNING_TREE
 from quad_envs.names import unknown_name
 
-from ..sweeps.folder import Finished, Run, read_contenders
+from ..sweeps.choices import TableChoice
+from ..sweeps.folder import Finished, Flown, Run, read_contenders
+from ..sweeps.protocol import protocol_facts
+from .answer import answer
 from .leaderboard import contender_board, leaderboard
-from .model import PAGE_FORMAT, Environment, Report
+from .model import PAGE_FORMAT, Answer, Board, Environment, Report
 from .page import render_page
 from .shelf import fill_shelf
 
@@ -49,25 +52,82 @@ def build_report(run: Run, choice: Choice | None = None) -> Report:
     environments = run.environments()
     wanted = None if choice is None else _resolve(run, choice)
     if wanted is not None:
-        environments = [entry for entry in environments if entry[0].title == wanted["env"]]
+        environments = [entry for entry in environments if entry.env.title == wanted["env"]]
     contenders = read_contenders(run.folder)
-    boards = []
-    for env, results, here in environments:
-        columns, rows = leaderboard(results.summary(), results.base_of(env.title))
-        trees = [one.evaluation.spanning_tree for one in here]
-        note = NO_SPANNING_TREE if False in trees else ""
-        base, compared = results.base_of(env.title), contender_board(contenders.get(env.title, ()))
-        boards.append(
-            Environment(env.title, env.id, env.kwargs, here[0].task, base, note, columns, rows, (), compared)
-        )
+    boards = [_environment(run, flown, contenders.get(flown.env.title, ())) for flown in environments]
     notes, provenance = _notes_of_run(run), _provenance(run)
-    bare = Report(PAGE_FORMAT, run.suite.name, provenance, notes, tuple(boards), (), wanted)
+    answers = _answers(run, environments)
+    bare = Report(PAGE_FORMAT, run.suite.name, provenance, notes, answers, tuple(boards), (), wanted)
     room = PAGE_BYTES - len(render_page(bare).encode())
     shelf = fill_shelf(
-        [here for _, _, here in environments], room, None if wanted is None else wanted["seed"]
+        [_to_show(flown.here) for flown in environments], room, None if wanted is None else wanted["seed"]
     )
     shown = (env._replace(flights=found) for env, found in zip(boards, shelf.flights, strict=True))
     return bare._replace(notes=(*notes, *shelf.notes), environments=tuple(shown), blobs=shelf.blobs.texts())
+
+
+def _tables(run: Run) -> list[TableChoice]:
+    """Of the suite; one without a label where it has none."""
+    return list(run.suite.tables) or [TableChoice("")]
+
+
+def _environment(run: Run, flown: Flown, compared: Sequence[Mapping[str, str]]) -> Environment:
+    """All but the flights."""
+    env, results = flown.env, flown.results
+    base = results.base_of(env.title)
+    columns, rows = leaderboard(results.summary(), base)
+    trees = [one.evaluation.spanning_tree for one in flown.here]
+    boards = []
+    for table in _tables(run):
+        board = contender_board(compared, table.label, table.about)
+        if board is not None:
+            boards.append(_with_flights(board, answer([run.contenders(flown.here, table.label)]), flown.here))
+    return Environment(
+        title=env.title,
+        place=flown.place,
+        condition=flown.condition,
+        id=env.id,
+        kwargs=env.kwargs,
+        task=flown.here[0].task,
+        base=base,
+        note=NO_SPANNING_TREE if False in trees else "",
+        columns=columns,
+        rows=rows,
+        answer=Answer() if boards else answer([run.contenders(flown.here)]),
+        boards=tuple(boards),
+    )
+
+
+def _with_flights(board: Board, found: Answer, here: Sequence[Finished]) -> Board:
+    """A board that names flights, of each contender those that are shown, in place of contenders."""
+    flown = {one.unit.policy.contender: one.unit.policy.title for one in _to_show(here)}
+    names = {flown[name]: row for name, row in board.names.items() if name in flown}
+    pair = tuple(flown[name] for name in found.pair if name in flown)
+    return board._replace(names=names, answer=found._replace(pair=pair))
+
+
+def _answers(run: Run, environments: Sequence[Flown]) -> tuple[str, ...]:
+    """Over all environments under the condition in which most were flown."""
+    conditions = [flown.condition for flown in environments]
+    most = max(conditions, key=conditions.count)
+    here = [flown for flown in environments if flown.condition == most]
+    if len(here) < 2:
+        return ()
+    out = []
+    for table in _tables(run):
+        said, _ = answer([run.contenders(flown.here, table.label) for flown in here])
+        head = ", ".join(filter(None, (table.label, most)))
+        out.append(f"{head[:1].upper()}{head[1:]}: {said}" if head else said)
+    return tuple(filter(None, out))
+
+
+def _to_show(here: Sequence[Finished]) -> list[Finished]:
+    """Whose flights stand in the page: of each contender one seed, of points of the frontier none."""
+    first: dict[str, Finished] = {}
+    for one in here:
+        if not one.unit.policy.trace:
+            first.setdefault(one.unit.policy.contender, one)
+    return list(first.values())
 
 
 def _starts(here: Sequence[Finished]) -> list[int]:
@@ -78,11 +138,12 @@ def _starts(here: Sequence[Finished]) -> list[int]:
 def _resolve(run: Run, choice: Choice) -> dict[str, Any]:
     """The chosen flight, with everything that was left open."""
     found = run.environments()
-    names = [env.title for env, _, _ in found]
-    matching = [entry for entry in found if choice.env in ("", entry[0].title, entry[0].id)]
+    names = [flown.env.title for flown in found]
+    matching = [flown for flown in found if choice.env in ("", flown.env.title, flown.env.id)]
     if not matching:
         raise ResultsError(unknown_name("environment of this run", choice.env, names))
-    env, _, here = next((entry for entry in matching if _starts(entry[2])), matching[0])
+    flown = next((one for one in matching if _starts(one.here)), matching[0])
+    env, here = flown.env, flown.here
     seeds = _starts(here)
     seed = choice.seed if choice.seed is not None else (seeds[0] if seeds else run.suite.seed)
     if seed not in seeds:
@@ -121,5 +182,6 @@ def _provenance(run: Run) -> dict[str, Any]:
         "first_seed": suite.seed,
         "last_seed": suite.seed + suite.episodes - 1,
         "episodes": suite.episodes,
+        "protocol": protocol_facts(suite),
         "policies": {policy.title: {"name": policy.name, **policy.kwargs} for policy in suite.policies},
     }

@@ -1,4 +1,4 @@
-"""The leaderboard of an environment: which columns it has, and their cells from the summary."""
+"""The tables of an environment on the page: which columns they have, and their cells from the summary."""
 
 from __future__ import annotations
 
@@ -10,7 +10,14 @@ from ..evaluation import column as evaluation
 from ..evaluation.column import COMPARED, COUNTED, PERCENT, UNSEEN
 from ..evaluation.columns import COLUMNS, fallbacks, limits_in, shown
 from ..sweeps.contenders import SCORES, SEEDS, TRAININGS
-from .model import Board, Column, Row
+from .model import Board, Column, Point, Row
+
+# What answers the question, in this order: the first that an environment has stand in the first table.
+_MAIN = (
+    *("score", "score_minus_base", "violation_share", "crashed", "quadratic_cost", "estimate_rmse"),
+    *("formation_rms", "decision_p50_ms"),
+)
+MAIN_COLUMNS = 6
 
 
 def leaderboard(
@@ -36,8 +43,18 @@ def leaderboard(
         if any(row.cells[column.key][0] is not None for row in rows)
         and not (column.kind == "difference" and len(rows) == 1)
     ]
+    kept = _with_main(kept)
     keys = [column.key for column in kept]
     return tuple(kept), tuple(row._replace(cells={key: row.cells[key] for key in keys}) for row in rows)
+
+
+def _with_main(columns: Sequence[Column]) -> list[Column]:
+    """Those of the first table marked, and before the others."""
+    keys = [column.key for column in columns]
+    first = [key for key in _MAIN if key in keys]
+    chosen = [*first[: MAIN_COLUMNS - 1], *first[-1:]] if len(first) > MAIN_COLUMNS else first
+    main = [column._replace(main=True) for key in chosen for column in columns if column.key == key]
+    return [*main, *(column for column in columns if column.key not in chosen)]
 
 
 def _page_column(column: evaluation.Column, base: str, kind: str = "") -> Column:
@@ -70,31 +87,58 @@ def _number(value: Any) -> float | None:
 # What the page shows of contenders.csv; those of SCORES have their interval in two more columns.
 _CONTENDERS = (
     *(COLUMNS["score"], *SCORES.values(), SEEDS, COLUMNS["crashed"], COLUMNS["violation_share"]),
+    *(COLUMNS["quadratic_cost"], COLUMNS["constraint_cost"], COLUMNS["position_rms"], COLUMNS["effort"]),
     *(COLUMNS["decision_p50_ms"], *TRAININGS.values()),
 )
 
 
-def contender_board(rows: Sequence[Mapping[str, str]]) -> Board | None:
+def contender_board(every: Sequence[Mapping[str, str]], title: str = "", about: str = "") -> Board | None:
     """What `contenders.csv` says of one environment and condition; None if it says nothing.
 
     Args:
-        rows: As text, of this environment and condition.
+        every: Rows as text, of this environment and condition.
+        title: Of the suite's table.
+        about: What its policies have in common.
     """
+    here = [row for row in every if row.get("table", "") == title]
+    rows = [row for row in here if not row.get("trace")]
     if not rows:
         return None
     base = rows[0]["base"]
-    kinds = dict.fromkeys(SCORES, "interval") | {"score": "number"}
+    kinds = dict.fromkeys(SCORES, "interval") | {"score": "score"}
     columns = [_page_column(column, base, kinds.get(column.name, "")) for column in _CONTENDERS]
     out = []
     for row in rows:
         cells: dict[str, tuple[float | None, ...]] = {}
         for column in columns:
-            ends = ("_low", "_high") if column.kind == "interval" else ()
-            cells[column.key] = tuple(_text_number(row.get(column.key + end)) for end in ("", *ends))
-        out.append(Row(f"{row['policy']} ({row['kind']})", False, cells))
-    kept = tuple(c for c in columns if any(row.cells[c.key][0] is not None for row in out))
+            value, *ends = (_text_number(row.get(column.key + end)) for end in ("", "_low", "_high"))
+            cells[column.key] = (value, *ends) if column.kind == "interval" else (value, _half(*ends))
+        out.append(Row(_titled(row), False, cells))
+    kept = _with_main([c for c in columns if any(row.cells[c.key][0] is not None for row in out)])
     titles = [one.policy for row, one in zip(rows, out, strict=True) if row["policy"] == base]
-    return Board(titles[0] if titles else base, kept, tuple(out))
+    frontier = tuple(_point(row) for row in here)
+    names = {row["policy"]: _titled(row) for row in rows}
+    board = Board(title, about, titles[0] if titles else base, tuple(kept), tuple(out), names)
+    return board._replace(frontier=frontier if any(point.trace for point in frontier) else ())
+
+
+def _titled(row: Mapping[str, str]) -> str:
+    """A contender and its kind."""
+    return f"{row['policy']} ({row['kind']})"
+
+
+def _half(low: float | None, high: float | None) -> float | None:
+    """Half the width of an interval."""
+    return None if low is None or high is None else 0.5 * (high - low)
+
+
+def _point(row: Mapping[str, str]) -> Point:
+    """A contender in the plane of score and cost."""
+    score, cost = (
+        tuple(_text_number(row.get(name + end)) for end in ("", "_low", "_high"))
+        for name in ("score", "quadratic_cost")
+    )
+    return Point(row["policy"], row["kind"], row.get("trace", ""), score, cost)
 
 
 def _text_number(text: str | None) -> float | None:

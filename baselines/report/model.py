@@ -30,7 +30,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-PAGE_FORMAT = 1  # of this data, for those who read it out of a page
+PAGE_FORMAT = 2  # of this data, for those who read it out of a page
 
 
 class Channel(NamedTuple):
@@ -69,6 +69,7 @@ class Column(NamedTuple):
     about: str
     better: int  # 1: more is better, -1: less is better, 0: neither
     kind: str = "number"  # or "score", "difference", "interval", "percent", "count"
+    main: bool = False  # whether it stands in the first table, and not behind "more" alone
 
 
 class Row(NamedTuple):
@@ -79,18 +80,42 @@ class Row(NamedTuple):
     cells: dict[str, tuple[float | None, ...]]  # column -> mean, half width; or value, low, high
 
 
-class Board(NamedTuple):
-    """A table of contenders: controllers, and networks with all their training seeds."""
+class Answer(NamedTuple):
+    """Who wins, by how much, and who is as good."""
 
+    sentence: str = ""
+    pair: tuple[str, ...] = ()  # the winner, and the best of those that are told apart from it
+
+
+class Point(NamedTuple):
+    """A contender in the plane of score and quadratic cost; each with the ends of its interval, or None."""
+
+    name: str
+    kind: str
+    trace: str  # line on which it lies, "" for none
+    score: tuple[float | None, ...]  # value, low, high
+    cost: tuple[float | None, ...]
+
+
+class Board(NamedTuple):
+    """A table of contenders: controllers, and networks and tuned controllers with all their seeds."""
+
+    title: str  # of the suite's table, "" where there is one only
+    about: str
     base: str
     columns: tuple[Column, ...]
     rows: tuple[Row, ...]
+    names: dict[str, str]  # contender -> its row; afterwards policy whose flights are shown -> row
+    frontier: tuple[Point, ...] = ()
+    answer: Answer = Answer()
 
 
 class Environment(NamedTuple):
     """An environment of the suite: how the policies did, and their flights."""
 
     title: str
+    place: str  # title without the condition
+    condition: str
     id: str
     kwargs: dict[str, Any]
     task: dict[str, Any]  # parameters as flown, see `folder.task_facts`
@@ -98,8 +123,9 @@ class Environment(NamedTuple):
     note: str
     columns: tuple[Column, ...]
     rows: tuple[Row, ...]
+    answer: Answer = Answer()
+    boards: tuple[Board, ...] = ()  # where policies have seeds, or the suite has tables
     flights: tuple[Flight, ...] = ()
-    contenders: Board | None = None  # where networks were trained
 
 
 class Report(NamedTuple):
@@ -109,6 +135,7 @@ class Report(NamedTuple):
     title: str
     run: dict[str, Any]  # command, versions, revision, platform, seeds, counts
     notes: tuple[str, ...]  # what is missing or was left out, and why
+    answers: tuple[str, ...]  # sentences over all environments, one per table; none where there is one
     environments: tuple[Environment, ...]
     blobs: tuple[str, ...]
     open: dict[str, Any] | None = None  # flight with which the page begins: env, seed, policy

@@ -17,6 +17,7 @@ SCRIPTS = (
     "data.js",
     "format.js",
     "table.js",
+    "frontier.js",
     "camera.js",
     "scene.js",
     "plots.js",

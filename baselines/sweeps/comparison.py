@@ -72,7 +72,7 @@ class Results:
         flown = [unit.policy for unit in self.flown() if unit.env.title == env]
         titles = [policy.title for policy in flown]
         if self.suite.base == BEST_MPC:
-            mpcs = [policy.title for policy in flown if plans(policy)]
+            mpcs = [policy.title for policy in flown if plans(policy) and not policy.trace]
             return min(mpcs, key=lambda title: rank_of([self.get(env, title)]), default=titles[0])
         return self.suite.base if self.suite.base in titles else titles[0]
 

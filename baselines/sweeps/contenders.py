@@ -18,7 +18,7 @@ from ..evaluation.column import COUNTED, LESS, MORE, TEAM, Column
 from ..evaluation.columns import COLUMNS, limits_in, shown
 from ..evaluation.evaluate import Evaluation
 from ..evaluation.metrics import summarize, totals, worst_violations
-from ..evaluation.statistics import Comparison, Interval, compare
+from ..evaluation.statistics import Comparison, Interval, compare, mean_interval
 from ..evaluation.table import Table, printed_table
 from ..evaluation.team_metrics import flight_values
 from ..policies.registry import behind_filter, from_outside, is_mpc
@@ -145,10 +145,21 @@ def find_contenders(
                     continue
                 one = tuple(flights[flown.title, policy.title] for policy in policies)
                 costs = [trained[env.title, policy.title] for policy in policies if policy.made is not None]
-                first = policies[0]
-                known = (_kind(first), plans(first), first.trace, first.tables)
-                found.append(Contender(env.title, condition, name, *known, one, tuple(costs)))
+                found.append(contender_of(env.title, condition, name, policies[0], one, tuple(costs)))
     return found
+
+
+def contender_of(
+    env: str,
+    condition: str,
+    name: str,
+    policy: PolicyChoice,
+    evaluations: tuple[Evaluation, ...],
+    trainings: tuple[Mapping[str, Any], ...],
+) -> Contender:
+    """A contender, of which any of its policies says what it is."""
+    known = _kind(policy), plans(policy), policy.trace, policy.tables
+    return Contender(env, condition, name, *known, evaluations, trainings)
 
 
 def plans(policy: PolicyChoice) -> bool:
@@ -193,6 +204,8 @@ def contender_rows(
             rival = rivals[one.env, one.condition]
             row = {"table": table, **one.row(), "mpc": one.mpc, "trace": one.trace, "base": rival.name}
             row |= _compared(one.beside(rival))
+            row |= _spread("score", mean_interval(one.values("score")))
+            row |= _spread("quadratic_cost", mean_interval(one.values("quadratic_cost")))
             cost = one.beside(rival, "quadratic_cost")
             row |= _spread(_COST.name, None if cost is None else cost.difference)
             rows.append(row)
@@ -215,7 +228,7 @@ def find_base(group: Sequence[Contender], base: str) -> Contender:
     by as much as chance makes one of them lead.
     """
     if base == BEST_MPC:
-        return min((one for one in group if one.mpc), key=Contender.rank, default=group[0])
+        return min((one for one in group if one.mpc and not one.trace), key=Contender.rank, default=group[0])
     return next((one for one in group if one.name == base), group[0])
 
 

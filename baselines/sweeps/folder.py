@@ -14,8 +14,9 @@ from baselines.evaluation.columns import Record
 from baselines.evaluation.evaluate import Evaluation
 from baselines.evaluation.team_metrics import by_flight
 from baselines.files import FAILURES, RESULTS_FORMAT, plain_json, read_json
-from baselines.sweeps.choices import EnvChoice
+from baselines.sweeps.choices import EnvChoice, PolicyChoice
 from baselines.sweeps.comparison import Results
+from baselines.sweeps.contenders import Contender, contender_of
 from baselines.sweeps.protocol import check_stored
 from baselines.sweeps.suite import BEST_MPC, Suite
 from baselines.sweeps.units import Unit, suite_units
@@ -37,6 +38,16 @@ class Finished(NamedTuple):
         return dict(islice(by_flight(self.evaluation.records).items(), self.flights_saved))
 
 
+class Flown(NamedTuple):
+    """An environment under a condition."""
+
+    env: EnvChoice
+    place: str  # title of the environment alone
+    condition: str
+    results: Results  # its table
+    here: list[Finished]  # its units
+
+
 class Run(NamedTuple):
     """A results folder."""
 
@@ -47,15 +58,42 @@ class Run(NamedTuple):
     units: int  # that the suite has
     failures: tuple[str, ...] = ()  # policies from outside that did not fly, and why
 
-    def environments(self) -> list[tuple[EnvChoice, Results, list[Finished]]]:
-        """Environments of which something is flown, each with its table and its units."""
+    def environments(self) -> list[Flown]:
+        """Environments of which something is flown, under each condition."""
         out = []
-        flown = [one for env in self.suite.envs for one in self.suite.flown(env).values()]
-        for env in flown:
-            here = [one for one in self.finished if one.unit.env.title == env.title]
-            if here:
-                out.append((env, _results(self.suite, env, here), here))
+        for place in self.suite.envs:
+            for condition, env in self.suite.flown(place).items():
+                here = [one for one in self.finished if one.unit.env.title == env.title]
+                if here:
+                    out.append(Flown(env, place.title, condition, _results(self.suite, env, here), here))
         return out
+
+    def contenders(self, here: Sequence[Finished], table: str = "") -> list[Contender]:
+        """Who is compared in an environment: what has all of its seeds, but for points of a trace.
+
+        Args:
+            here: What was flown there.
+            table: Label of the table; all of them if empty.
+        """
+        groups: dict[str, list[Finished]] = {}
+        for one in here:
+            tables = one.unit.policy.tables
+            if not one.unit.policy.trace and (not table or not tables or table in tables):
+                groups.setdefault(one.unit.policy.contender, []).append(one)
+        found = []
+        for name, group in groups.items():
+            policy = group[0].unit.policy
+            seeds = [other for other in self.suite.policies if _same(other, policy)]
+            if len(group) == len(seeds):
+                evaluations = tuple(one.evaluation for one in group)
+                title = group[0].unit.env.title
+                found.append(contender_of(title, "", name, policy, evaluations, ()))
+        return found
+
+
+def _same(one: PolicyChoice, other: PolicyChoice) -> bool:
+    """Whether they are seeds of one contender in the same environments."""
+    return (one.contender, one.envs) == (other.contender, other.envs)
 
 
 def _results(suite: Suite, env: EnvChoice, here: Sequence[Finished]) -> Results:

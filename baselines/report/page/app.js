@@ -1,6 +1,7 @@
 // The page around the flights: heading, environments, how to repeat the run, theme, pointer and keys.
 
 const ORBIT = 0.008; // rad per pixel
+const LONG = 12; // entries, beyond which a list is folded
 const KEY_ORBIT = 0.12; // rad per key
 
 function attachCamera(canvas, camera, redraw) {
@@ -36,6 +37,7 @@ function attachCamera(canvas, camera, redraw) {
 
 function onKey(event) {
   const { target, key } = event;
+  if (key === "Escape" && viewer.follow) return viewer.leaveMoment();
   const typing = target.matches("select, textarea, input:not([type=range])");
   const pressing = target.matches("button, a");
   if (typing || event.ctrlKey || event.metaKey || event.altKey || !viewer.shown.length) return;
@@ -61,9 +63,14 @@ function showHeading() {
   const policies = Object.keys(run.policies).length;
   const many = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;
   const seeds = run.episodes === 1 ? `seed ${run.first_seed}` : `seeds ${run.first_seed} to ${run.last_seed}`;
+  const { protocol } = run;
+  const places = new Set(environments.map(({ place }) => place));
+  const conditions = new Set(environments.map(({ condition }) => condition));
+  const version = protocol.version ? `${protocol.whole ? "" : "a part of "}protocol ${protocol.version}, definition ${protocol.definition} · ` : "";
   byId("facts").textContent =
-    `${many(environments.length, "environment")} · ${policies === 1 ? "1 policy" : `${policies} policies`} · ` +
+    `${version}${many(places.size, "environment")} · ${conditions.size > 1 ? `${many(conditions.size, "condition")} · ` : ""}${policies === 1 ? "1 policy" : `${policies} policies`} · ` +
     `${many(run.episodes, "flight")} each, ${seeds}`;
+  byId("answers").append(...report.answers.map((sentence) => element("p", {}, sentence)));
   byId("notes").append(...report.notes.map((note) => element("li", {}, note)));
 }
 
@@ -72,25 +79,56 @@ function shortTitle({ title }) {
   return title.replace(/^quad\/(\w+)-v\d+/, "$1");
 }
 
-function showEnvironments() {
-  const tabs = report.environments.map((environment) =>
-    element("button", { type: "button", onclick: () => choose(environment) }, shortTitle(environment)),
+/** One button per name in a row of tabs; the row is empty where there is nothing to choose. */
+function showTabs(id, names, chosen, onchoose) {
+  const tabs = names.map((name) =>
+    element("button", { type: "button", "aria-current": String(name === chosen), onclick: () => onchoose(name) }, shortTitle({ title: name })),
   );
-  if (tabs.length > 1) byId("environments").append(...tabs);
+  byId(id).replaceChildren(...(tabs.length > 1 ? tabs : []));
+}
+
+function showEnvironments() {
+  const distinct = (names) => [...new Set(names)];
   const choose = (environment, opened) => {
-    tabs.forEach((tab, i) => tab.setAttribute("aria-current", String(report.environments[i] === environment)));
-    byId("board").replaceChildren(drawBoard(environment));
-    byId("contenders").hidden = !environment.contenders;
-    if (environment.contenders) byId("contenders-board").replaceChildren(drawBoard(environment.contenders));
-    const differences = environment.rows.length > 1 ? ` Δ: paired differences to ${environment.base} on the same starts; ▲ better, ▼ worse, where the interval excludes zero.` : "";
-    const note = environment.note ? ` Note: ${environment.note}.` : "";
-    byId("board-lede").textContent =
-      `${environment.id}. Means over flights with 95 % intervals; – where a crash leaves no honest mean.${differences}${note}`;
+    const { place, condition } = environment;
+    const here = report.environments.filter((other) => other.place === place);
+    showTabs("environments", distinct(report.environments.map((other) => other.place)), place, (name) => {
+      const there = report.environments.filter((other) => other.place === name);
+      choose(there.find((other) => other.condition === condition) ?? there[0]);
+    });
+    showTabs("conditions", here.map((other) => other.condition), condition, (name) => choose(here.find((other) => other.condition === name)));
     showRun(environment);
-    viewer.open(environment, opened);
+    showTables(environment, byId("tables").dataset.chosen ?? environment.boards[0]?.title, opened);
   };
   const opened = report.open;
   choose(report.environments.find((environment) => environment.title === opened?.env) ?? report.environments[0], opened);
+}
+
+/** The tables of an environment, and the answer that stands in them. */
+function showTables(environment, title, opened) {
+  const { boards } = environment;
+  const board = boards.find((other) => other.title === title) ?? boards[0];
+  const shown = board ?? environment;
+  viewer.open(environment, board, opened);
+  byId("tables").dataset.chosen = board?.title ?? "";
+  const labels = boards.map((other) => [other.title, other.title]);
+  byId("tables").replaceChildren(...(boards.length > 1 ? [switchOf("Table", labels, board.title, (name) => showTables(environment, name))] : []));
+  byId("answer").textContent = shown.answer.sentence;
+  byId("board").replaceChildren(drawBoard(shown, shown.columns.filter((column) => column.main)));
+  byId("board-more").replaceChildren(drawBoard(shown));
+  byId("more").hidden = shown.columns.every((column) => column.main);
+  byId("frontier").hidden = !board?.frontier.length;
+  if (board?.frontier.length) byId("frontier-picture").replaceChildren(drawFrontier(board));
+  byId("policies").hidden = !board;
+  byId("policies-board").replaceChildren(...(board ? [drawBoard(environment)] : []));
+  const flights = report.run.episodes;
+  const intervals = flights < 5 ? `; no intervals, which ${flights === 1 ? "one flight does" : `${flights} flights do`} not give` : " with 95 % intervals, and rounded to them";
+  const base = shown.base.replace(/ \([a-z-]+\)$/, "");
+  const differences = shown.rows.length > 1 ? ` Δ: paired differences to ${base} on the same starts; ▲ better, ▼ worse, where the interval excludes zero.` : "";
+  const note = environment.note ? ` Note: ${environment.note}.` : "";
+  const about = board?.about ? ` ${board.title}: ${board.about}.` : "";
+  byId("board-lede").textContent =
+    `${environment.id}. Means over flights${intervals}; – where a crash leaves no honest mean.${differences}${about}${note}`;
 }
 
 function list(title, entries) {
@@ -121,6 +159,7 @@ function showRun(environment) {
     element("pre", { tabindex: "0" }, run.command || "(not recorded)"),
     element("div", { class: "facts-grid" },
       list("Run", [
+        ...(run.protocol.version ? [["protocol", words(run.protocol)]] : []),
         ["git revision", run.revision ?? "not recorded"], ["seeds", `${run.first_seed} to ${run.last_seed}`],
         ...entries(run.versions), ["platform", run.platform],
       ]),
@@ -128,9 +167,15 @@ function showRun(environment) {
       list("Limits, SI", entries(limits)),
       list("Vehicle, SI", entries(params)),
       list("Weights", entries(weights)),
-      list("Policies", environment.rows.map(({ policy }) => [policy, policyWords(policy, run.policies[policy])])),
+      many("Policies", environment.rows.map(({ policy }) => [policy, policyWords(policy, run.policies[policy])])),
     ),
   );
+}
+
+/** A list that is folded where it is long. */
+function many(title, entries) {
+  if (entries.length <= LONG) return list(title, entries);
+  return element("details", {}, element("summary", {}, `${title}: ${entries.length}`), list(title, entries));
 }
 
 function useTheme(dark) {
@@ -150,6 +195,7 @@ function start() {
   byId("play").addEventListener("click", () => viewer.toggle());
   byId("scrub").addEventListener("input", (event) => viewer.seek(Number(event.target.value)));
   byId("reset").addEventListener("click", () => {
+    viewer.leaveMoment();
     viewer.camera.home();
     viewer.drawScenes();
   });

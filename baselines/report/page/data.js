@@ -50,6 +50,13 @@ function samplePoint(table, row) {
   return [sample(table[0], row), sample(table[1], row), sample(table[2], row)];
 }
 
+/** Distance of a vehicle to its reference in each row; null where it has none. */
+function distances(flight, vehicle) {
+  const [p, wanted] = [flight.tables.p[vehicle], flight.tables.reference?.[vehicle]];
+  if (!wanted) return null;
+  return p[0].map((_, k) => Math.hypot(p[0][k] - wanted[0][k], p[1][k] - wanted[1][k], p[2][k] - wanted[2][k]));
+}
+
 /** The last row that a vehicle reached: it stays there after a crash. */
 function lastRow(flight, vehicle) {
   return flight.lengths[vehicle];

@@ -1,6 +1,7 @@
 // Words, numbers, colours and elements. Text from the data is only ever set as text, never as markup.
 
 const VEHICLE_COLOURS = 8;
+const NO_MORE = 1e-4; // half width over the mean, below which the interval is not worth its digits
 
 function element(kind, settings = {}, ...children) {
   const made = document.createElement(kind);
@@ -31,16 +32,28 @@ function number(value, digits = 4) {
   return value.toFixed(Math.max(0, places)).replace("-", "−");
 }
 
-function signed(value, digits = 3) {
-  const text = number(Math.abs(value), digits);
-  return value < 0 ? `−${text}` : `+${text}`;
+/** Decimal places that an interval leaves meaning to: one digit of its half width, two where it begins with 1. */
+function placesOf(half) {
+  const power = Math.floor(Math.log10(half));
+  return -power + (half / 10 ** power < 2 ? 1 : 0);
 }
 
-/** Half a width to as many places as its mean has, but never to none of its own digits. */
-function halfWidth(half, mean) {
-  const places = (mean.split(".")[1] ?? "").replace(/e.*/, "").length;
-  if (mean.includes("e") || half === 0 || half < 10 ** -places) return number(half, 2);
-  return half.toFixed(places);
+/** A number to so many places; below none to tens, hundreds and so on. */
+function toPlaces(value, places) {
+  const text = places >= 0 ? value.toFixed(Math.min(places, 8)) : (Math.round(value / 10 ** -places) * 10 ** -places).toFixed(0);
+  return Number(text) === 0 ? text.replace("-", "") : text.replace("-", "−");
+}
+
+/** A mean and the half width of its interval as texts, rounded to the interval; without one the half is null. */
+function rounded(mean, half, digits = 3) {
+  if (mean === null) return ["–", null];
+  if (half === null || half === undefined || !(half > NO_MORE * Math.abs(mean))) return [number(mean, digits), null];
+  const places = placesOf(half);
+  return [toPlaces(mean, places), toPlaces(half, places)];
+}
+
+function withSign(text) {
+  return text.startsWith("−") || text === "–" ? text : `+${text}`;
 }
 
 /** The colour variable of a policy, or of a vehicle where one team alone is shown. */

@@ -1,5 +1,6 @@
 // Plots over time that share their axis and their cursor. The lines are drawn once; the cursors are elements above.
 
+const OUTLIER = 4; // times the next largest value, beyond which a line leaves the axis
 const MARGIN = { left: 46, right: 10, top: 6, bottom: 18 };
 
 class Plot {
@@ -41,16 +42,16 @@ class Plot {
   /** Limits are part of the picture, unless everything stays far away from them. */
   findRange() {
     const { groups, limits, zero, log, band } = this.spec;
-    let [low, high] = [Infinity, -Infinity];
-    for (const { values, end } of groups.flatMap((group) => group.series)) {
-      for (let k = 0; k < Math.min(values.length, end + 1); k++) {
-        if (Number.isFinite(values[k])) {
-          low = Math.min(low, values[k]);
-          high = Math.max(high, values[k]);
-        }
-      }
-    }
+    const ranges = groups.map(({ series }) => rangeOf(series));
+    let low = Math.min(...ranges.map((range) => range[0]));
+    let high = Math.max(...ranges.map((range) => range[1]));
     if (low > high) [low, high] = [0, 1];
+    const others = log ? high : withoutOutliers(ranges.map((range) => range[1]));
+    this.outside = groups.filter((_, i) => ranges[i][1] > others).map((group) => group.label);
+    high = Math.min(high, others);
+    this.root.querySelector("h3 small").textContent = this.outside.length
+      ? `${this.spec.unit}; ${this.outside.join(", ")} leaves the axis`
+      : this.spec.unit;
     if (log) {
       if (band) [low, high] = [Math.min(low, band[0]), Math.max(high, band[1])];
       return [Math.log10(Math.max(low, 1e-4)) - 0.1, Math.log10(Math.max(high, 1e-4)) + 0.1];
@@ -168,17 +169,22 @@ class Plot {
     const at = hovered ?? time;
     this.spec.groups.forEach((group, i) => {
       const found = group.series.map((series) => valueAt(series, at)).filter(Number.isFinite);
-      const text = found.length > 4 ? `${number(Math.min(...found), 3)} … ${number(Math.max(...found), 3)}` : found.map((v) => number(v, 3)).join("  ");
+      const said = (value) => toPlaces(value, this.spec.places);
+      const text = found.length > 4 ? `${said(Math.min(...found))} … ${said(Math.max(...found))}` : found.map(said).join("  ");
       this.values[i].textContent = text || "–";
     });
     this.tip.style.visibility = here && hovered !== null ? "visible" : "hidden";
     if (here && hovered !== null) this.fillTip(hovered);
   }
 
+  said(value) {
+    return Number.isFinite(value) ? toPlaces(value, this.spec.places) : "–";
+  }
+
   fillTip(time) {
     const lines = this.spec.groups.flatMap((group) =>
       group.series.slice(0, 12).map((series) =>
-        element("div", { own: group.colour }, `${[group.label, series.name].filter(Boolean).join(" · ")}  ${number(valueAt(series, time), 4)}`),
+        element("div", { own: group.colour }, `${[group.label, series.name].filter(Boolean).join(" · ")}  ${this.said(valueAt(series, time))}`),
       ),
     );
     this.tip.replaceChildren(element("span", {}, `${time.toFixed(2)} s`), ...lines.slice(0, 16));
@@ -192,6 +198,25 @@ class Plot {
 function valueAt({ values, dt, end }, time) {
   const row = Math.floor(time / dt + 1e-6);
   return row > end ? NaN : values[Math.min(row, values.length - 1)];
+}
+
+/** Smallest and largest value of some lines; [Infinity, -Infinity] where there is none. */
+function rangeOf(series) {
+  let [low, high] = [Infinity, -Infinity];
+  for (const { values, end } of series) {
+    for (let k = 0; k < Math.min(values.length, end + 1); k++) {
+      if (!Number.isFinite(values[k])) continue;
+      low = Math.min(low, values[k]);
+      high = Math.max(high, values[k]);
+    }
+  }
+  return [low, high];
+}
+
+/** Where an axis ends so that one line far above the others does not flatten them. */
+function withoutOutliers(highs) {
+  const [first, second] = [...highs].sort((a, b) => b - a);
+  return second > 0 && first > OUTLIER * second ? 1.5 * second : first;
 }
 
 function decades(low, high) {

@@ -1,6 +1,7 @@
 // One moment of one or several flights in space. Everything is drawn from rows of the flights' tables.
 
 const SIGMA_95 = 2.7955; // sqrt of the 95 % quantile of chi-square with 3 degrees of freedom
+const LEAST_LABELLED = 46; // px, from which an error says how long it is
 const LEAST_ARM = 11; // px, below which vehicles are drawn larger than they are
 const CIRCLE = Array.from({ length: 33 }, (_, i) => [Math.cos((i * Math.PI) / 16), Math.sin((i * Math.PI) / 16)]);
 const EDGES = [0, 1, 2, 3, 4, 5, 6, 7].flatMap((a) => [1, 2, 4].filter((bit) => !(a & bit)).map((bit) => [a, a | bit]));
@@ -41,7 +42,11 @@ class Scene {
   show(shown, bounds) {
     this.shown = shown;
     this.bounds = bounds;
-    this.floor = bounds.high[2] + 0.12 * Math.max(1, bounds.high[2] - bounds.low[2]);
+    let lowest = bounds.high[2]; // z points down
+    for (const { flight } of shown) {
+      for (const [, , z] of flight.tables.p) for (const value of z) if (value > lowest) lowest = value;
+    }
+    this.floor = lowest + 0.12 * Math.max(1, bounds.high[2] - bounds.low[2]);
   }
 
   draw(time) {
@@ -206,6 +211,7 @@ class Scene {
       const now = Math.min(row, last);
       this.path(this.rows(table, Math.floor(now), last), withAlpha(colour, 0.28), 1.3);
       this.path([...this.rows(table, 0, Math.floor(now)), places[vehicle]], colour, 2);
+      this.drawError(flight, vehicle, row, places[vehicle], colour);
       this.drawBelief(flight, vehicle, row, colour);
       const [x, y, z] = places[vehicle];
       if (z < this.floor) {
@@ -215,6 +221,26 @@ class Scene {
       const depth = this.project(places[vehicle])[2];
       return { depth, paint: () => this.drawVehicle(flight, vehicle, places[vehicle], now, colour, row >= last) };
     });
+  }
+
+  /** From a vehicle to where it should be, with the distance where there is room for it. */
+  drawError(flight, vehicle, row, place, colour) {
+    const table = flight.tables.reference?.[vehicle];
+    if (!table || flight.lengths.length > 1 || row > lastRow(flight, vehicle)) return;
+    const wanted = samplePoint(table, Math.min(row, table[0].length - 1));
+    this.path([place, wanted], colour, 1.6, [1.5, 4]);
+    const [[x0, y0, near], [x1, y1, far]] = [this.project(place), this.project(wanted)];
+    if (!(Math.min(near, far) > this.project.near) || Math.hypot(x1 - x0, y1 - y0) < LEAST_LABELLED) return;
+    const { context } = this;
+    context.font = "600 12px system-ui, sans-serif";
+    context.textAlign = "left";
+    context.lineWidth = 3;
+    context.strokeStyle = this.colours.paper;
+    context.fillStyle = colour;
+    const text = `${Math.hypot(...minus(place, wanted)).toFixed(2)} m`;
+    const at = [0.5 * (x0 + x1) + 8, 0.5 * (y0 + y1) + 4];
+    context.strokeText(text, ...at);
+    context.fillText(text, ...at);
   }
 
   drawLinks(flight, places, row) {

@@ -53,18 +53,16 @@ const isTeam = ({ task }) => task.mission !== "tracking";
 
 function distancePlot(context) {
   if (isTeam(context)) return null;
-  const groups = groupsOf(context, "p", (p, flight, vehicle) => {
-    const wanted = flight.tables.reference?.[vehicle];
-    if (!wanted) return [];
-    const values = p[0].map((_, k) => Math.hypot(p[0][k] - wanted[0][k], p[1][k] - wanted[1][k], p[2][k] - wanted[2][k]));
-    return [{ values, dash: SOLID }];
+  const groups = groupsOf(context, "p", (_, flight, vehicle) => {
+    const values = distances(flight, vehicle);
+    return values ? [{ values, dash: SOLID }] : [];
   });
-  return { title: "Position error", unit: "m", groups, zero: true, limits: [] };
+  return { title: "Position error", unit: "m", places: 3, groups, zero: true, limits: [] };
 }
 
 function slotPlot(context) {
   if (context.task.mission === "estimation") return null; // there it is the error of the estimate
-  return { title: "Formation error", unit: "m, to the own slot", groups: groupsOf(context, "slot_error", plain), zero: true, limits: [] };
+  return { title: "Formation error", unit: "m, to the own slot", places: 3, groups: groupsOf(context, "slot_error", plain), zero: true, limits: [] };
 }
 
 function separationPlot(context) {
@@ -74,7 +72,7 @@ function separationPlot(context) {
     { value: task.separation, text: "d_s" },
     { value: task.crash_distance, text: "crash" },
   ].filter(({ value }) => value);
-  return { title: "Nearest vehicle", unit: "m", groups: groupsOf(context, "separation", plain), zero: true, limits };
+  return { title: "Nearest vehicle", unit: "m", places: 3, groups: groupsOf(context, "separation", plain), zero: true, limits };
 }
 
 function estimatePlot(context) {
@@ -83,13 +81,13 @@ function estimatePlot(context) {
     const values = table[0].map((_, k) => Math.hypot(...[0, 1, 2].map((axis) => table[axis][k] - target[axis][k])));
     return [{ values, dash: SOLID }];
   });
-  return { title: "Error of the estimated position", unit: "m", groups, zero: true, limits: [] };
+  return { title: "Error of the estimated position", unit: "m", places: 3, groups, zero: true, limits: [] };
 }
 
 function neesPlot(context) {
   const groups = groupsOf(context, "nees", plain);
   const [low, high] = NEES_BAND;
-  return { title: "NEES", unit: "χ²(3), band: 95 %", groups, log: true, band: [low, high], limits: [] };
+  return { title: "NEES", unit: "χ²(3), band: 95 %", places: 2, groups, log: true, band: [low, high], limits: [] };
 }
 
 function forcePlot(context) {
@@ -103,7 +101,7 @@ function forcePlot(context) {
   const limits = [...new Set(context.task.force_max)].map((value) => ({ value, text: "max" }));
   limits.push({ value: 0, text: "" });
   const unit = isTeam(context) && context.focus === null ? "N, largest and smallest of a vehicle" : "N, four rotors";
-  return { title: "Rotor forces", unit, groups, limits, zero: true, fine: true };
+  return { title: "Rotor forces", unit, places: 2, groups, limits, zero: true, fine: true };
 }
 
 function attitudePlot(context) {
@@ -114,16 +112,16 @@ function attitudePlot(context) {
     if (all) return [{ values: table[0].map((roll, k) => DEGREES * Math.max(Math.abs(roll), Math.abs(table[1][k]))), dash: SOLID }];
     return ["roll", "pitch", "yaw"].map((name, i) => ({ values: table[i].map((angle) => DEGREES * angle), dash: DASHES[i], name }));
   });
-  if (all) return { title: "Tilt", unit: "°, larger of |roll| and |pitch|", groups, limits: limits.slice(0, 1), zero: true };
-  return { title: "Attitude", unit: "°, roll, pitch (dashed), yaw (dotted)", groups, limits, fine: true };
+  if (all) return { title: "Tilt", unit: "°, larger of |roll| and |pitch|", places: 1, groups, limits: limits.slice(0, 1), zero: true };
+  return { title: "Attitude", unit: "°, roll, pitch (dashed), yaw (dotted)", places: 1, groups, limits, fine: true };
 }
 
 function constraintPlot(context, name, index) {
   const groups = groupsOf(context, "constraints", (table) => [{ values: table[index], dash: SOLID }]);
   const unit = `${context.task.constraint_units?.[index] ?? "SI"}, value minus limit; above 0 is violated`;
-  return { title: `Limit: ${name.replaceAll("_", " ")}`, unit, groups, limits: [{ value: 0, text: "limit" }], above: 0 };
+  return { title: `Limit: ${name.replaceAll("_", " ")}`, unit, places: 3, groups, limits: [{ value: 0, text: "limit" }], above: 0 };
 }
 
 function decisionPlot(context) {
-  return { title: "Decision time", unit: "ms per vehicle", groups: groupsOf(context, "decision", plain), log: true, limits: [] };
+  return { title: "Decision time", unit: "ms per vehicle", places: 3, groups: groupsOf(context, "decision", plain), log: true, limits: [] };
 }

@@ -1,7 +1,7 @@
 // The leaderboard: sortable by click and by keyboard, with intervals and paired differences.
 
 /** board: an environment, or its contenders; what is drawn needs `base`, `columns` and `rows`. */
-function drawBoard(environment) {
+function drawBoard(environment, columns = environment.columns) {
   const state = { key: "score", down: true };
   const head = element("tr");
   const body = element("tbody");
@@ -17,7 +17,7 @@ function drawBoard(environment) {
     return element("th", { scope: "col", "data-key": key }, button);
   };
   head.append(heading("policy", "Policy", "", "name of the policy", -1));
-  for (const column of environment.columns) {
+  for (const column of columns) {
     head.append(heading(column.key, column.title, column.unit, column.about, column.better));
   }
   const value = (row) => (state.key === "policy" ? row.policy : row.cells[state.key]?.[0]);
@@ -28,7 +28,7 @@ function drawBoard(environment) {
     return state.down ? -sign : sign;
   };
   const fill = () => {
-    body.replaceChildren(...[...environment.rows].sort(order).map((row) => boardRow(environment, row, scale)));
+    body.replaceChildren(...[...environment.rows].sort(order).map((row) => boardRow(environment, row, columns, scale)));
     for (const th of head.children) {
       if (th.dataset.key === state.key) th.setAttribute("aria-sort", state.down ? "descending" : "ascending");
       else th.removeAttribute("aria-sort");
@@ -40,12 +40,12 @@ function drawBoard(environment) {
   return element("table", {}, element("thead", {}, head), body);
 }
 
-function boardRow(environment, row, scale) {
+function boardRow(environment, row, columns, scale) {
   const own = `var(${colourName(environment.rows.indexOf(row))})`;
   const name = element("th", { scope: "row", own }, element("span", { class: "swatch" }), row.policy);
   if (row.privileged) name.append(element("span", { class: "tag", title: "it decides from the whole truth" }, "privileged"));
   if (row.policy === environment.base) name.append(element("span", { class: "tag" }, "base"));
-  const cells = environment.columns.map((column) => boardCell(column, row, environment, scale, own));
+  const cells = columns.map((column) => boardCell(column, row, environment, scale, own));
   return element("tr", {}, name, ...cells);
 }
 
@@ -55,9 +55,11 @@ function boardCell(column, row, environment, scale, own) {
   if (column.kind === "interval") return intervalCell(column, row.cells[column.key], row.policy === environment.base);
   const cell = element("td", { own });
   const factor = column.kind === "percent" ? 100 : 1;
-  const text = mean === null ? "–" : column.kind === "count" ? String(Math.round(mean)) : number(factor * mean);
+  const [text, spread] = column.kind === "count" && mean !== null
+    ? [String(Math.round(mean)), null]
+    : rounded(mean === null ? null : factor * mean, half === null ? null : factor * half);
   const words = [text];
-  if (half !== null && mean !== null) words.push(element("span", { class: "half" }, `± ${halfWidth(factor * half, text)}`));
+  if (spread !== null) words.push(element("span", { class: "half" }, `± ${spread}`));
   if (column.kind !== "score" || mean === null) cell.append(...words);
   else cell.append(element("span", { class: "score" }, scoreBar(mean, half ?? 0, scale), element("span", {}, ...words)));
   return cell;
@@ -71,9 +73,9 @@ function differenceCell(column, mean, half, isBase) {
   const good = mean * column.better > 0;
   const word = !clear || !column.better ? "" : good ? "better" : "worse";
   const cell = element("td", { class: word, title: word || "the interval contains zero" });
-  const text = signed(mean);
-  cell.append(`${word ? (good ? "▲ " : "▼ ") : ""}${text}`);
-  if (half !== null) cell.append(element("span", { class: "half" }, `± ${halfWidth(half, text)}`));
+  const [text, spread] = rounded(mean, half);
+  cell.append(`${word ? (good ? "▲ " : "▼ ") : ""}${withSign(text)}`);
+  if (spread !== null) cell.append(element("span", { class: "half" }, `± ${spread}`));
   return cell;
 }
 
@@ -82,10 +84,13 @@ function intervalCell(column, [value, low, high], isBase) {
   if (value === null) return element("td", {}, "–");
   const isDifference = column.key.endsWith("_minus_base");
   if (isBase && isDifference) return element("td", { class: "half" }, "base");
-  const word = !isDifference || low * high <= 0 ? "" : value > 0 ? "better" : "worse";
-  const text = isDifference ? signed(value) : number(value, 3);
+  const known = low !== null && high !== null;
+  const word = !isDifference || !known || low * high <= 0 ? "" : value > 0 ? "better" : "worse";
+  const places = known && high > low ? placesOf(0.5 * (high - low)) : null;
+  const said = (x) => (places === null ? number(x, 3) : toPlaces(x, places));
+  const text = isDifference ? withSign(said(value)) : said(value);
   const mark = word ? (value > 0 ? "▲ " : "▼ ") : "";
-  const ends = low === null ? null : element("span", { class: "half" }, `[${number(low, 3)}, ${number(high, 3)}]`);
+  const ends = known ? element("span", { class: "half" }, `[${said(low)}, ${said(high)}]`) : null;
   return element("td", { class: word }, mark + text, ends);
 }
 

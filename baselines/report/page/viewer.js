@@ -1,22 +1,25 @@
 // The flights of one environment: what is chosen, the clock, and who draws it.
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4];
+const MOMENT = [1.5, 1.0]; // s before and after the largest difference that are played again and again
+const LEAST_LOOK = 0.5; // m, half width of the closest look
 const byId = (id) => document.getElementById(id);
 
 const viewer = {
-  environment: null, camera: new Camera(), scenes: [], plots: [], shown: [],
+  environment: null, board: null, camera: new Camera(), scenes: [], plots: [], shown: [],
   seed: null, chosen: new Set(), layout: "overlay", focus: null, follow: "",
   time: 0, length: 1, speed: 1, playing: false, hovered: null, hoveredPlot: null, turn: 0,
+  loop: null, // [begin, end] in s that is played again and again
 
-  async open(environment, opened) {
+  /** board: the table of the environment whose policies are shown; null for all of them. */
+  async open(environment, board, opened) {
     this.environment = environment;
+    this.board = board ?? null;
     this.stop();
     const seeds = this.seeds();
     const any = seeds.length > 0;
     for (const part of document.querySelectorAll(".viewer, #choices")) part.hidden = !any;
-    byId("flight-lede").textContent = any
-      ? "The same start, flown by the policies that are switched on."
-      : "No flight of this environment is stored in the results folder.";
+    byId("flight-lede").textContent = any ? "" : "No flight of this environment is stored in the results folder.";
     if (!any) return;
     this.seed = opened?.seed ?? seeds[0];
     this.focus = null;
@@ -24,7 +27,47 @@ const viewer = {
     this.time = 0;
     this.camera.home();
     this.follow = "";
+    this.loop = null;
     await this.refresh(true);
+    if (!opened && environment === this.environment) this.showMoment();
+  },
+
+  /** Look closely at the moment at which the flights differ most, and play around it. */
+  showMoment() {
+    const moment = this.findMoment();
+    if (!moment) return;
+    const [before, after] = MOMENT;
+    this.follow = "reference";
+    this.camera.follow(Math.max(LEAST_LOOK, 0.9 * moment.reach));
+    this.show(moment.time);
+    this.drawChoices();
+    if (window.matchMedia("(prefers-reduced-motion: reduce)").matches) return;
+    this.loop = [Math.max(0, moment.time - before), Math.min(this.length, moment.time + after)];
+    this.show(this.loop[0]);
+    this.start();
+  },
+
+  /** When the distances of two flights to the reference differ most, and the larger one; of one, its largest. */
+  findMoment() {
+    if (this.environment.task.mission !== "tracking") return null;
+    const errors = this.shown.slice(0, 2).map(({ flight }) => distances(flight, 0)).filter(Boolean);
+    if (!errors.length) return null;
+    const [one, other] = errors;
+    let [most, at] = [-1, 0];
+    for (let k = 0; k < Math.min(...errors.map((values) => values.length)); k++) {
+      const difference = other ? Math.abs(one[k] - other[k]) : one[k];
+      if (difference > most) [most, at] = [difference, k];
+    }
+    return { time: at * this.shown[0].flight.dt, reach: Math.max(...errors.map((values) => values[at])) };
+  },
+
+  /** The whole scene again, and the whole time. */
+  leaveMoment() {
+    this.loop = null;
+    this.follow = "";
+    this.camera.follow(null);
+    this.drawChoices();
+    this.drawScenes();
   },
 
   seeds() {
@@ -32,19 +75,24 @@ const viewer = {
   },
 
   flightsHere() {
-    return this.environment.flights.filter((flight) => flight.seed === this.seed);
+    const here = this.environment.flights.filter((flight) => flight.seed === this.seed);
+    const known = here.filter((flight) => this.board && flight.policy in this.board.names);
+    return known.length ? known : here;
   },
 
-  /** The base and whoever did best, unless a policy was asked for. */
+  /** Those of the answer, else whoever did best and the base, unless a policy was asked for. */
   firstChoice(wanted) {
     const here = this.flightsHere().map((flight) => flight.policy);
     if (wanted && here.includes(wanted)) return [wanted];
+    const { pair } = (this.board ?? this.environment).answer;
+    if (pair.length && pair.every((policy) => here.includes(policy))) return pair;
     const [best, second] = [...this.flightsHere()].sort((a, b) => b.score - a.score).map((flight) => flight.policy);
     const { base } = this.environment;
     return [best, here.includes(base) && base !== best ? base : second].filter(Boolean);
   },
 
   colourIndex(policy) {
+    if (this.board) return this.board.rows.findIndex((row) => row.policy === this.board.names[policy]);
     return this.environment.rows.findIndex((row) => row.policy === policy);
   },
 
@@ -76,6 +124,7 @@ const viewer = {
     const bounds = flights.length ? extent(flights, this.environment.task) : null;
     if (refit && bounds) this.camera.fit(bounds.low, bounds.high);
     this.scenes = groups.filter((group) => group.length).map((group) => this.pane(group, bounds));
+    byId("panes").classList.toggle("many", this.scenes.length > 2);
     byId("panes").replaceChildren(...this.scenes.map(({ root }) => root));
   },
 
@@ -134,6 +183,7 @@ const viewer = {
     focus.hidden = size < 2;
     const view = selectOf("View", this.views(size), this.follow, (value) => {
       this.follow = value;
+      this.loop = null;
       this.camera.follow(value === "target" ? 0.3 : value ? 1.6 : null);
       this.drawScenes();
     });
@@ -145,15 +195,27 @@ const viewer = {
   views(size) {
     const vehicles = Array.from({ length: size }, (_, i) => [String(i), size > 1 ? `follow vehicle ${i + 1}` : "follow the vehicle"]);
     const target = this.shown.some(({ flight }) => flight.tables.target) ? [["target", "follow the target"]] : [];
-    return [["", "whole scene"], ...vehicles, ...target];
+    const reference = this.environment.task.mission === "tracking" ? [["reference", "vehicles and reference"]] : [];
+    return [["", "whole scene"], ...reference, ...vehicles, ...target];
   },
 
   /** What the camera looks at, where it follows something. */
   anchor(scene) {
     const { flight } = scene.shown[0];
+    if (this.follow === "reference") return this.closely(scene);
     const table = this.follow === "target" ? flight.tables.target?.[0] : flight.tables.p[Number(this.follow)];
     if (this.follow === "" || !table) return null;
     return samplePoint(table, Math.min(this.time / flight.dt, table[0].length - 1));
+  },
+
+  /** Middle of the vehicles and of where they should be. */
+  closely(scene) {
+    const places = scene.shown.flatMap(({ flight }) => {
+      const row = Math.min(this.time / flight.dt, lastRow(flight, 0));
+      const tables = [flight.tables.p[0], flight.tables.reference?.[0]].filter(Boolean);
+      return tables.map((table) => samplePoint(table, Math.min(row, table[0].length - 1)));
+    });
+    return [0, 1, 2].map((axis) => places.reduce((sum, place) => sum + place[axis] / places.length, 0));
   },
 
   chip(flight) {
@@ -185,6 +247,7 @@ const viewer = {
     const team = task.mission !== "tracking";
     const parts = [];
     if (task.mission !== "estimation") parts.push(team ? "dashed: wanted ways, cross: where each should be now" : "dashed: reference, cross: where the vehicle should be now");
+    if (!team) parts.push("dotted: error, from the vehicle to there");
     if (task.mission !== "estimation") parts.push("filled rotor: front, strokes: thrust");
     if (team) parts.push("grey lines: who hears whom, dot nearer the hearer");
     if (this.shown.some(({ flight }) => flight.tables.target)) parts.push("diamond: target");
@@ -212,7 +275,13 @@ const viewer = {
     this.plots.forEach((plot) => plot.mark(this.time, this.hovered, plot === this.hoveredPlot));
   },
 
+  /** Go to a time that a person chose. */
   seek(time) {
+    this.loop = null;
+    this.show(time);
+  },
+
+  show(time) {
     this.time = Math.max(0, Math.min(this.length, time));
     this.draw();
   },
@@ -236,7 +305,9 @@ const viewer = {
     let before = performance.now();
     const tick = (now) => {
       if (!this.playing) return;
-      this.seek(this.time + (this.speed * Math.max(0, now - before)) / 1000);
+      const [begin, end] = this.loop ?? [0, Infinity];
+      const next = this.time + (this.speed * Math.max(0, now - before)) / 1000;
+      this.show(next > end ? begin : next);
       before = now;
       if (this.time >= this.length) this.stop();
       else requestAnimationFrame(tick);
