@@ -28,6 +28,10 @@ def test_a_shipped_policy_is_small_and_says_what_made_it(name):
     assert (SHIPPED / name / "curve.csv").read_text().startswith("cpu_seconds,steps,updates,score")
 
 
+def test_a_policy_for_several_tasks_stands_for_none_of_them():
+    assert shipped_name("apg", "quad/RandomTracking-v0") == "apg-random"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_shipped_policy_has_its_recorded_score(name):

@@ -28,15 +28,23 @@ def shipped_policies() -> dict[str, str]:
 
 def _describe(path: Path) -> str:
     said = json.loads(path.read_text(encoding="utf-8"))
-    return f"{said['algorithm']} ({said['kind']}) on {said['env_id']}, score {said['score']:.3f}"
+    where = " with other ".join(filter(None, (said["env_id"], ", ".join(said.get("env_kwargs", {})))))
+    return f"{said['algorithm']} ({said['kind']}) on {where}, score {said['score']:.3f}"
 
 
 @cache
 def _shipped_for() -> dict[tuple[str, str], str]:
-    """(algorithm, environment id) -> name."""
+    """(algorithm, environment id) -> name, of those that were trained for this task alone."""
     files = SHIPPED.glob(f"*/{_DESCRIPTION}")
     said = {path.parent.name: json.loads(path.read_text("utf-8")) for path in files}
-    return {(entry["algorithm"], entry["env_id"]): name for name, entry in sorted(said.items())}
+    pairs = {name: (entry["algorithm"], entry["env_id"]) for name, entry in sorted(said.items())}
+    return {pair: name for name, pair in pairs.items() if name == name_for(*pair)}
+
+
+def name_for(algorithm: str, env_id: str) -> str:
+    """What the shipped policy of an algorithm for a task alone is called, as "ppo-helix"."""
+    task = env_id.rsplit("/", 1)[-1].removesuffix("-v0").removesuffix("Tracking")
+    return f"{algorithm}-{task.lower()}"
 
 
 def shipped_for(env_id: str) -> list[str]:

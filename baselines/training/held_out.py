@@ -107,11 +107,11 @@ def _registered(env_id: str) -> dict[str, Any]:
 
 
 class HeldOutFlights:
-    """Flights from held-out starts, of one task."""
+    """Flights from held-out starts, of one task; `flights` of them, or those that judge while training."""
 
-    def __init__(self, env_id: str, env_kwargs: Mapping[str, Any]) -> None:
+    def __init__(self, env_id: str, env_kwargs: Mapping[str, Any], flights: int | None = None) -> None:
         name = env_id.removeprefix("quad_envs:")
-        self.flights = _TEAM_FLIGHTS if name in TEAMS else _FLIGHTS
+        self.flights = flights or (_TEAM_FLIGHTS if name in TEAMS else _FLIGHTS)
         if name in TEAMS:
             self.env: Any = import_module(TEAMS[name]).vector_env(self.flights, **env_kwargs)
         else:

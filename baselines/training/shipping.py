@@ -1,45 +1,54 @@
 """Shipped policies: `python -m baselines.training.shipping RUN ...` copies networks of runs into the suite.
 
-A shipped policy is a checkpoint with the command, seed, versions and revision that made it, its learning
-curve, and its score on starts that neither training nor the choice of the best network has seen.
+`--best NAME` copies one of them: the best on starts that choose, under the name NAME. A shipped policy is a
+checkpoint with the command, seed, versions and revision that made it, its learning curve, and its score on
+starts that neither training nor the choice of the best network has seen.
 """
 
 from __future__ import annotations
 
+import argparse
 import shutil
-import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from ..files import read_json
 from ..policies.checkpoints import load_checkpoint, save_checkpoint
-from ..policies.trained import SHIPPED
-from .held_out import HELD_OUT, HeldOutFlights, Point, Progress
+from ..policies.trained import SHIPPED, name_for
+from .held_out import CHOOSING, HELD_OUT, HeldOutFlights, Point, Progress
 
+_CHOOSING_FLIGHTS = 100  # among runs; while training fewer choose among the networks of one
 _SAID = (
     *("env_id", "env_kwargs", "mission", "algorithm", "kind", "seed", "hyperparameters", "made_by", "budget"),
     *("cpu_seconds", "steps", "updates"),
 )
 
 
-def shipped_folder(env_id: str, algorithm: str) -> Path:
-    """Where the policy of an algorithm for a task goes, as policies/ppo-helix."""
-    task = env_id.rsplit("/", 1)[-1].removesuffix("-v0").removesuffix("Tracking")
-    return SHIPPED / f"{algorithm}-{task.lower()}"
+def judged(network_folder: Path, seed: int = HELD_OUT, flights: int | None = None) -> Point:
+    """The network of a checkpoint in the task on which it was trained, under its conditions.
 
-
-def judged(network_folder: Path) -> Point:
-    """The network of a checkpoint on held-out starts of the task on which it was trained."""
+    Args:
+        network_folder: Of the checkpoint.
+        seed: Environment seed of the first flight; those from HELD_OUT on are of no choice.
+        flights: How many; as while training if not given.
+    """
     network, said = load_checkpoint(network_folder)
-    flights = HeldOutFlights(said["env_id"], said["env_kwargs"])
+    held_out = HeldOutFlights(said["env_id"], said["env_kwargs"], flights)
     spent = Progress(said["updates"], said["steps"], float("nan"))
-    return flights.judge(network, said["cpu_seconds"], spent, HELD_OUT)
+    return held_out.judge(network, said["cpu_seconds"], spent, seed)
 
 
-def ship(run: Path) -> Path:
+def best_of(runs: Sequence[Path]) -> Path:
+    """The run whose network has the highest score on _CHOOSING_FLIGHTS starts that choose."""
+    return max(runs, key=lambda run: judged(run, CHOOSING, _CHOOSING_FLIGHTS).score)
+
+
+def ship(run: Path, name: str = "") -> Path:
     """Copy the best network of a run into the suite.
 
     Args:
         run: Folder of a training.
+        name: Of the policy; by its algorithm and task if not given.
 
     Returns:
         Where it is now.
@@ -48,7 +57,8 @@ def ship(run: Path) -> Path:
         CheckpointError: If it holds no checkpoint, or the suite's folder cannot be written.
     """
     network, said = load_checkpoint(run)
-    folder, point = shipped_folder(said["env_id"], said["algorithm"]), judged(run)
+    folder = SHIPPED / (name or name_for(said["algorithm"], said["env_id"]))
+    point = judged(run)
     about = {name: said[name] for name in _SAID} | {
         "score": point.score,
         "violation_share": point.violation_share,
@@ -62,7 +72,16 @@ def ship(run: Path) -> Path:
     return folder
 
 
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
+    parser.add_argument("--best", default="", metavar="NAME", help="ship the best of the runs as NAME")
+    options = parser.parse_args(arguments)
+    for run in [best_of(options.runs)] if options.best else options.runs:
+        where = ship(run, options.best)
+        print(f"{run} -> {where.name}: score {judged(where).score:.4f}")
+
+
 if __name__ == "__main__":
-    for name in sys.argv[1:]:
-        where = ship(Path(name))
-        print(f"{name} -> {where.name}: score {judged(where).score:.4f}")
+    main()
