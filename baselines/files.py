@@ -1,12 +1,13 @@
 """The results folder: written atomically, locked while a sweep runs, and resumable.
 
 config.json        suite, its protocol if it is one, versions, git revision, command
-cells/*.json       one finished unit (environment x policy) each
+cells/*.json       up to 500 flights of one unit (environment x policy) each; the name ends with a digest of
+                   all that they depend on, the seed of the first start, and how many there are
 episodes/*.npz     the first flights of each unit, or all if asked for; a team in one file, vehicles first
 report.html        the leaderboard and these flights to look at, see `baselines.report`
 results.csv        one row per environment x policy x flight (x vehicle), when all units are finished
 summary.csv        one row per environment x policy
-failures.json      policies from outside that could not be made or broke off, where, and why
+failures.json      policies that could not be made or broke off, where, and why
 contenders.csv     one row per table x environment x contender, where policies have seeds: all of them are one
 networks/          folders of networks, see training/run_folder.py, and of tuned controllers
 """
@@ -47,7 +48,7 @@ _RESULTS = (
     "cells/*.json",
     "episodes/*.npz",
 )
-RESULTS_FORMAT = 2  # of the folder; 1 had neither this number nor the tasks in its cells
+RESULTS_FORMAT = 3  # of the folder; 2 had one cell per unit, 1 neither this number nor tasks in cells
 _DISTRIBUTIONS = ("gymnasium", "pettingzoo", "numpy", "scipy", "numba", "osqp", "joblib")
 
 

@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .authority import hover_authority
-from .compilation.decorators import kernel
+from .compilation.decorators import inline_kernel, kernel
 from .kinds import as_tuple, is_number, make_kind, refuse_class, without_booleans
 from .limits import Limits
 from .names import shown, unknown_name
+from .normals import draw, drawn_size, key_of
 from .parameters import Array, QuadrotorParams
 
 _Vector = tuple[float, float, float]
@@ -114,26 +115,51 @@ _FORCE_SHARE = 0.25  # and not above
 _FORCE_OF_WEIGHT = 1.0 / 16.0  # 0.49 N of the default vehicle
 
 
-@kernel
-def _gauss_markov(x: Array, size: Array, keep: float, fresh: float, out: Array) -> None:
-    """First-order Gauss-Markov processes at the nodes of all steps.
+# What normal numbers of an episode's key are for, see `normals.draw`.
+_AT_FIRST, _FROM_NODE_TO_NODE = 0, 1
+_FIRST_NUMBERS = drawn_size(6)
+
+
+@inline_kernel
+def blow(nodes: Array, key: int, period: int, keep: float, size: Array, drawn: Array) -> None:
+    """Gusts of the next control period: first-order Gauss-Markov processes, exactly discretised.
+
+    Each component goes on as x_i = e^(-h / tau) x_i-1 + sqrt(1 - e^(-2 h / tau)) sigma z_i from stage time to
+    stage time, h apart, and begins as sigma z_0.
 
     Args:
-        x: White noise, (steps (nodes - 1) + 1, 6); becomes x_i = keep x_i-1 + fresh size x_i.
-        size: Standard deviations, (6,).
-        keep: What is left of a value after the time between nodes.
-        fresh: sqrt(1 - keep^2).
-        out: Result, (steps, nodes, 6); the last node of a step is the first one of the next.
+        nodes: Those of the period before, of which the last is the first of this one, (2 substeps + 1, 6).
+        key: Of the episode.
+        period: Control period, from 0.
+        keep: e^(-h / tau), what is left of a value from node to node.
+        size: Standard deviations sigma, (6,).
+        drawn: Scratch, (gust_numbers(2 substeps + 1),).
     """
-    for c in range(6):
-        x[0, c] *= size[c]
-    for i in range(1, x.shape[0]):
+    last = nodes.shape[0] - 1
+    if period == 0:
+        draw(key, 0, _AT_FIRST, drawn[:_FIRST_NUMBERS])
         for c in range(6):
-            x[i, c] = x[i, c] * size[c] * fresh + keep * x[i - 1, c]
+            nodes[last, c] = size[c] * drawn[c]
+    for c in range(6):
+        nodes[0, c] = nodes[last, c]
+    draw(key, period, _FROM_NODE_TO_NODE, drawn)
+    fresh = math.sqrt(1.0 - keep * keep)
+    for i in range(1, last + 1):
+        for c in range(6):
+            nodes[i, c] = keep * nodes[i - 1, c] + fresh * size[c] * drawn[6 * (i - 1) + c]
+
+
+def gust_numbers(nodes: int) -> int:
+    """Length of the scratch of `blow` for control periods of so many nodes."""
+    return drawn_size(6 * (nodes - 1))
+
+
+@kernel
+def _tabulate_gusts(key: int, keep: float, size: Array, drawn: Array, out: Array) -> None:
+    """Gusts of all periods, (steps, nodes, 6)."""
     for k in range(out.shape[0]):
-        for node in range(out.shape[1]):
-            for c in range(6):
-                out[k, node, c] = x[k * (out.shape[1] - 1) + node, c]
+        out[k] = out[max(k - 1, 0)]
+        blow(out[k], key, k, keep, size, drawn)
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,14 +211,19 @@ class Gusts:
         parts = (np.asarray(value, dtype=np.float64) for value in (known.torque, known.force))
         return np.concatenate([np.broadcast_to(part, 3) for part in parts])
 
+    def keep(self, h: float) -> float:
+        """What is left of a value after a time h, s."""
+        return math.exp(-h / self.correlation_time)
+
     def values(self, t: Array, rng: np.random.Generator) -> Array:
-        """Torque and force at the nodes, (n_steps, n_nodes, 6), continuous from step to step."""
+        """Torque and force at the nodes, (n_steps, n_nodes, 6), continuous from step to step.
+
+        They follow from one uniform number of the generator. Environments draw them period by period.
+        """
         steps, nodes = t.shape
-        times = np.append(t[:, :-1].ravel(), t[-1, -1])
-        keep = math.exp(-float(times[1] - times[0]) / self.correlation_time)
-        out = np.empty((steps, nodes, 6))
-        white = rng.standard_normal((times.size, 6))
-        _gauss_markov(white, self.size(), keep, math.sqrt(1.0 - keep * keep), out)
+        out = np.zeros((steps, nodes, 6))
+        key, drawn = int(key_of(rng.random())), np.empty(gust_numbers(nodes))
+        _tabulate_gusts(key, self.keep(float(t[0, 1] - t[0, 0])), self.size(), drawn, out)
         return out
 
 

@@ -6,6 +6,7 @@ import csv
 import errno
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,11 +15,14 @@ import numpy as np
 import pytest
 
 import baselines.files
+import baselines.sweeps.store
 import baselines.sweeps.sweep
 from baselines import Results, ResultsError, Suite, load_suite, run_benchmark
 from baselines.evaluation.evaluate import Evaluation
 from baselines.files import locked, plain_json, write_atomic, write_csv
 from baselines.policies.registry import TRACKING_POLICIES
+from baselines.policies.trained import SHIPPED
+from baselines.sweeps.folder import read_run
 from baselines.sweeps.suite_files import suite_names
 from quad_envs.registration import TRACKING
 
@@ -85,7 +89,7 @@ def test_the_folder_holds_configuration_results_summary_and_flights(finished):
 
 
 def test_a_saved_flight_has_its_arrays(finished):
-    path = sorted((finished[1] / "episodes").iterdir())[0]
+    path = sorted((finished[1] / "episodes").glob("*hover*"))[0]
     with np.load(path) as arrays:
         assert arrays["states"].shape == (201, 16) and arrays["commands"].shape == (200, 4)
 
@@ -147,13 +151,78 @@ def test_files_of_these_names_that_are_not_ours_are_left_alone(tmp_path, name, t
 
 def test_another_suite_in_the_same_folder_is_refused(tmp_path):
     run_benchmark(SMALL, tmp_path)
-    with pytest.raises(ResultsError, match=r"holds another suite \(it differs in episodes, seed\)"):
+    with pytest.raises(ResultsError, match=r"holds another suite \(it differs in seed\)"):
         run_benchmark(SMALL | {"episodes": 4, "seed": 0}, tmp_path)
+
+
+def test_more_flights_extend_a_folder_and_fewer_are_read_from_it(tmp_path, flown, monkeypatch):
+    monkeypatch.setattr(baselines.sweeps.store, "BLOCK", 2)  # of 3, 6 and 4 flights
+    run_benchmark(SMALL, tmp_path)
+    assert len(flown) == 8
+    more = run_benchmark(SMALL | {"episodes": 6}, tmp_path)
+    assert len(flown) == 16
+    once = run_benchmark(SMALL | {"episodes": 6})
+    assert without_times(more.rows()) == without_times(once.rows())
+    fewer = run_benchmark(SMALL | {"episodes": 4}, tmp_path)
+    assert len(flown) == 16 + 12 and fewer.evaluations[0].flights == 4
+    assert [record.score for record in fewer.evaluations[0].records] == [
+        record.score for record in once.evaluations[0].records[:4]
+    ]
+    assert read_run(tmp_path).finished[0].evaluation.flights == 4
+    assert more.evaluations[0].decision_ms == fewer.evaluations[0].decision_ms
+
+
+def test_a_unit_flies_again_when_a_file_that_it_reads_has_changed(tmp_path, flown):
+    table = tmp_path / "ref.csv"
+
+    def write(speed):
+        t = np.linspace(0.0, 10.0, 21)
+        rows = np.column_stack([t, speed * t, 0.0 * t, -1.0 + 0.0 * t])
+        np.savetxt(table, rows, delimiter=",", header="t,x,y,z", comments="")
+
+    write(0.2)
+    checkpoint = tmp_path / "net"
+    shutil.copytree(SHIPPED / "apg-helix", checkpoint)
+    env = {"id": "quad/HelixTracking-v0", "kwargs": {"reference": str(table)}}
+    suite = SMALL | {"envs": [env], "policies": ["hover", str(checkpoint)], "compare_with": "hover"}
+    first = run_benchmark(suite, tmp_path / "out")
+    assert run_benchmark(suite, tmp_path / "out").rows() == first.rows() and len(flown) == 2
+    shutil.copytree(SHIPPED / "dagger-helix", checkpoint, dirs_exist_ok=True)
+    with pytest.warns(UserWarning, match=r"net' flies again in .*what it reads has changed \(.*net\)"):
+        run_benchmark(suite, tmp_path / "out")
+    assert len(flown) == 3
+    write(0.3)
+    with pytest.warns(UserWarning, match=r"flies again in .*what it reads has changed \(.*ref\.csv"):
+        second = run_benchmark(suite, tmp_path / "out")
+    assert len(flown) == 5 and second.get(*_titles(suite, "hover")) != first.get(*_titles(suite, "hover"))
+
+
+def _titles(suite, policy):
+    return Suite.from_dict(load_suite(suite).to_dict()).envs[0].title, policy
+
+
+def test_titles_that_differ_in_other_characters_have_files_of_their_own(tmp_path):
+    policies = [{"name": "hover", "label": "a b"}, {"name": "random", "label": "a-b"}]
+    results = run_benchmark(SMALL | {"policies": policies, "compare_with": ""}, tmp_path)
+    assert len(list((tmp_path / "cells").iterdir())) == 4
+    again = run_benchmark(SMALL | {"policies": policies, "compare_with": ""}, tmp_path)
+    assert again.rows() == results.rows()
+
+
+def test_results_of_another_numpy_are_not_mixed(tmp_path, monkeypatch):
+    run_benchmark(SMALL, tmp_path)
+    real = baselines.sweeps.store.provenance()
+    other = real | {"versions": real["versions"] | {"numpy": "1.0"}}
+    monkeypatch.setattr(baselines.sweeps.store, "provenance", lambda: other)
+    with pytest.raises(
+        ResultsError, match=r"begun with numpy .*, and here is 1\.0: their numbers do not mix"
+    ):
+        run_benchmark(SMALL, tmp_path)
 
 
 def test_results_of_other_sources_are_not_mixed(tmp_path, monkeypatch):
     run_benchmark(SMALL, tmp_path)
-    monkeypatch.setattr(baselines.sweeps.sweep, "source_digest", lambda: "0123abc")
+    monkeypatch.setattr(baselines.files, "source_digest", lambda: "0123abc")
     with pytest.raises(ResultsError, match="begun with other sources"):
         run_benchmark(SMALL, tmp_path)
 

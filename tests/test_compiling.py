@@ -18,8 +18,8 @@ UNIT = _unit("quad/HelixTracking-v0", "hover")
 
 
 def leave_mark(unit):
-    """Say which process did a piece; the folder is where a unit saves flights."""
-    (unit.episode_folder / str(os.getpid())).touch()
+    """Say which process did a piece; the name of its policy is a folder."""
+    Path(unit.policy_name, str(os.getpid())).touch()
 
 
 def fail_elsewhere(unit):
@@ -55,7 +55,7 @@ def finish(pieces, helpers, monkeypatch):
 
 
 def test_another_process_helps_and_each_piece_is_done_once(tmp_path, monkeypatch):
-    pieces = [Piece(str(i), leave_mark, UNIT._replace(episode_folder=tmp_path)) for i in range(40)]
+    pieces = [Piece(str(i), leave_mark, UNIT._replace(policy_name=str(tmp_path))) for i in range(40)]
     monkeypatch.setattr(compiling, "kept_in", lambda: Path())
     said = []
     with _Helpers(deque(pieces), 1, lambda title, seconds: said.append(title)) as crew:
@@ -69,7 +69,7 @@ def test_another_process_helps_and_each_piece_is_done_once(tmp_path, monkeypatch
 
 def test_what_fails_in_another_process_is_done_here(tmp_path, monkeypatch):
     env = UNIT.env.__class__(UNIT.env.id, {}, str(os.getpid()))
-    unit = UNIT._replace(episode_folder=tmp_path, env=env)
+    unit = UNIT._replace(policy_name=str(tmp_path), env=env)
     pieces = [Piece(str(i), fail_elsewhere, unit) for i in range(3)]
     assert sorted(finish(pieces, 2, monkeypatch)) == ["0", "1", "2"]
     assert [mark.name for mark in tmp_path.iterdir()] == [str(os.getpid())]

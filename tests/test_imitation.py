@@ -187,6 +187,32 @@ def test_hyperparameters_of_teams_are_refused_for_one_vehicle(name):
         next(policy_gradient(training_options(HELIX, {}), given, 0, lambda: 0.0))
 
 
+@pytest.mark.parametrize(
+    ("env_kwargs", "start", "message"),
+    [
+        (
+            {"graph": "complete"},
+            None,
+            r"sees rows 0 of 'comm', where .* rows 0, 1, 2, 3, 4: choose a graph in",
+        ),
+        ({"formation": "lattice", "vehicles": 8}, None, r"rows 0, 1, 2, 3, 4 of 'sensed', .*: pass sensed=5"),
+        ({}, "apg-helix", r"sees rows 0, 1, .* of 'preview', .* rows 0, 2, 5: give the same stages"),
+        ({"comm": "plan"}, None, "choose comm='state'"),
+        ({"graph": lambda k: np.eye(6) + np.random.default_rng().random((6, 6))}, None, "drawn at random"),
+        ({"reward": "quadratic"}, None, "reward='bounded', got 'quadratic'"),
+    ],
+)
+def test_a_team_or_a_start_that_does_not_fit_is_refused_before_anything_is_written(
+    tmp_path, env_kwargs, start, message
+):
+    given = {"formation": "hexagon"} | env_kwargs
+    with pytest.raises(ValueError, match=message):
+        train(
+            FORMATION, "apg", env_kwargs=given, start_from=start or "dagger-formation", steps=1, out=tmp_path
+        )
+    assert not (tmp_path / "config.json").exists()
+
+
 def test_a_network_with_other_layers_is_no_start():
     wrong, steps = still(task_of(HELIX)), iter([0.0, 1.0])
     with pytest.raises(ValueError, match="give the same net_arch"):

@@ -8,6 +8,8 @@ import llvmlite.binding as llvm
 import numba
 import numpy as np
 import pytest
+from drawn import errors, gusts
+from gymnasium.utils import seeding
 
 from quad_envs import Gusts, Steady
 from quad_envs.compilation.decorators import kernel
@@ -30,6 +32,7 @@ from quad_envs.envs.shared.task_vector import task_vector
 from quad_envs.envs.shared.vehicle_options import CRASH_TILT
 from quad_envs.envs.tracking.kernel import command, judge
 from quad_envs.lanes import LANES, N_FLIGHT, N_TRACKING, Blocks
+from quad_envs.normals import draw
 from quad_envs.references import Heading, Racetrack, RandomSmooth
 from quad_envs.reward import stage_cost
 from quad_envs.table_row import N_TABLE
@@ -52,7 +55,8 @@ class Twin:
     """n flights of a task in readable equations: RK4 with exact sines, rotors that lag in closed form."""
 
     def __init__(self, task, substeps, plants, force=(0.0, 0.0, 0.0), torque=(0.0, 0.0, 0.0)):
-        self.task, self.substeps, self.air = task, substeps, {"force": force, "torque": torque}
+        self.task, self.substeps = task, substeps
+        self.air = np.broadcast_to([*torque, *force], (2 * substeps + 1, 1, 6))  # at the stage times
         self.plants, self.command = plants.copy(), np.full((len(plants), 4), task.hover_force)
 
     def fly(self, commands):
@@ -61,18 +65,19 @@ class Twin:
         x, F = self.plants[:, :12], self.plants[:, 12:]
         target = np.clip(commands, 0.0, rotor_limits(task.force_max, task.params))
 
-        def slope(state, forces):
-            return derivative_reference(state, forces, task.params, **self.air)
+        def slope(state, forces, node):
+            torque, force = np.split(self.air[node], 2, axis=-1)
+            return derivative_reference(state, forces, task.params, torque, force)
 
         def lagged(time):
             return target + (F - target) * np.exp(-task.params.rotor_rate * time)
 
-        for _ in range(self.substeps):
+        for s in range(self.substeps):
             half, whole = lagged(0.5 * h), lagged(h)
-            k_1 = slope(x, F)
-            k_2 = slope(x + 0.5 * h * k_1, half)
-            k_3 = slope(x + 0.5 * h * k_2, half)
-            k_4 = slope(x + h * k_3, whole)
+            k_1 = slope(x, F, 2 * s)
+            k_2 = slope(x + 0.5 * h * k_1, half, 2 * s + 1)
+            k_3 = slope(x + 0.5 * h * k_2, half, 2 * s + 1)
+            k_4 = slope(x + h * k_3, whole, 2 * s + 2)
             x, F = x + h / 6.0 * (k_1 + 2.0 * k_2 + 2.0 * k_3 + k_4), whole
         return np.concatenate([x, F], axis=1)
 
@@ -127,6 +132,45 @@ def test_lanes_fly_as_the_readable_equations_over_random_episodes_with_crashes(a
     assert crashes > n // 3
 
 
+def test_gusts_and_noise_in_lanes_are_the_readable_ones_over_random_episodes_with_crashes():
+    n, steps, substeps, noise = LANES + 1, 40, 3, (0.01, 0.02, 0.005, 0.03)
+    wind = Gusts(force=(0.3, 0.2, 0.4), torque=(0.01, 0.02, 0.001), correlation_time=0.4)
+    options = {"disturbance": wind, "sensor_noise": noise, "substeps": substeps, "lost_distance": 6.0}
+    options |= {"reveal_disturbance": True, "time_limit": steps * 0.05, **LIMITS}
+    env = gym.make_vec(HELIX, num_envs=n, **options)
+    observations, _ = env.reset(seed=1)
+    task, keep = env.unwrapped.task, np.exp(-0.05 / (2 * substeps) / 0.4)
+    layout, table = task.layout, with_turn_rates(env.unwrapped.reference[0], task.dt)
+    generators = [seeding.np_random(1 + i)[0] for i in range(n)]
+    air, keys, twins = [None] * n, [0] * n, [None] * n
+    rng, since, crashes, begins = np.random.default_rng(0), np.zeros(n, int), 0, np.ones(n, bool)
+    (down, late), rewards, actions = np.zeros((2, n), bool), np.zeros(n), np.zeros((n, 4))
+    for _ in range(90):
+        for i in range(n):
+            if begins[i]:
+                generators[i].random(12)
+                keys[i] = int(generators[i].random() * 2.0**53)
+                air[i] = gusts(keys[i], steps, 2 * substeps + 1, keep, wind.size())
+                twins[i], since[i] = Twin(task, substeps, env.unwrapped.state[i : i + 1]), 0
+            else:
+                twins[i].air = air[i][since[i]][:, None]
+                since[i] += 1
+                reward, _, _, crashed = twins[i].step(actions[i : i + 1], table[since[i]], 6.0)
+                assert reward[0] == pytest.approx(rewards[i], rel=1e-8, abs=1e-10) and crashed[0] == down[i]
+                crashes += int(crashed[0])
+            seen = layout.decode(observations[i])
+            told = twins[i].plants[0, :12] + errors(keys[i], since[i], noise)
+            np.testing.assert_allclose(seen.V_B, told[3:6], rtol=1e-6, atol=1e-6)
+            np.testing.assert_allclose(seen.Omega, told[9:], rtol=1e-6, atol=1e-6)
+            np.testing.assert_allclose(seen.position, told[:3], rtol=1e-6, atol=1e-6)
+            ahead = air[i][since[i], substeps] if since[i] < steps else np.zeros(6)
+            np.testing.assert_allclose([*seen.torque, *seen.force], ahead, rtol=1e-6, atol=1e-9)
+        actions = rng.uniform(-0.6, 0.6, (n, 4)).astype(np.float32)
+        begins = down | late
+        observations, rewards, down, late, _ = env.step(actions)
+    assert crashes > n
+
+
 def instructions(compiled, *arguments):
     """Packed and scalar arithmetic on doubles in the machine code of a kernel, compiled anew."""
     anew = numba.jit(**compiled.entry.targetoptions)(compiled.py_func)
@@ -145,13 +189,16 @@ def instructions(compiled, *arguments):
         (arrive, (), 15),
         (command, "task", 20),
         (judge, "task", 100),
+        (draw, "numbers", 80),
     ],
 )
 def test_loops_over_lanes_are_vector_instructions(compiled, rest, packed):
     task = task_vector(gym.make(HELIX).unwrapped.task, 5, 50.0)
     w = np.zeros(N_FLIGHT if rest != "task" else N_TRACKING)
-    vector, scalar = instructions(compiled, w, *((task,) if rest == "task" else rest))
-    assert vector >= packed and scalar <= vector // 2
+    given = {"task": (w, task), "numbers": (1, 2, 3, np.zeros(64))}.get(rest, (w, *rest))
+    vector, scalar = instructions(compiled, *given)
+    assert vector >= packed
+    assert scalar <= (vector if rest == "numbers" else vector // 2)  # numbers: of a rest below four
 
 
 @pytest.mark.parametrize("threads", [2, 3, 64])
@@ -219,19 +266,6 @@ def test_four_places_take_the_squared_distance_of_the_nearest_point():
     _nearest(block, points)
     np.testing.assert_allclose(block[12:], expected, rtol=1e-15)
     assert np.array_equal(block[:12], places[:3].ravel())
-
-
-def test_gusts_are_first_order_gauss_markov_processes_that_join_from_step_to_step():
-    gusts = Gusts(force=(0.1, 0.2, 0.3), torque=0.02, correlation_time=0.7)
-    times = 0.05 * (np.arange(40.0)[:, None] + np.linspace(0.0, 1.0, 11))
-    found = gusts.values(times, np.random.default_rng(4))
-    white = np.random.default_rng(4).standard_normal((401, 6)) * gusts.size()
-    keep = np.exp(-0.005 / 0.7)
-    expected = [white[0]]
-    for fresh in white[1:]:
-        expected.append(keep * expected[-1] + np.sqrt(1.0 - keep**2) * fresh)
-    np.testing.assert_allclose(found[:, :-1].reshape(-1, 6), expected[:-1], rtol=1e-9, atol=1e-12)
-    assert np.array_equal(found[1:, 0], found[:-1, -1])
 
 
 def test_a_random_reference_is_the_sum_of_its_sines():

@@ -21,6 +21,7 @@ from baselines.report.page import embed, render_page
 from baselines.report.quantise import Blobs, decode, encode
 from baselines.report.shelf import _PER_FLIGHT
 from baselines.sweeps.folder import read_run
+from baselines.sweeps.store import cells_of
 from baselines.sweeps.sweep import REPORTED
 
 EVIL = "</script><script>alert('{{style}}')</script><!--"
@@ -72,7 +73,7 @@ def a_flight(run):
     """First unit with its first saved flight: path, records."""
     one = run.finished[0]
     seed, team = next(iter(one.flights().items()))
-    return one, one.unit.episode_file(seed), team
+    return one, one.episode_file(seed), team
 
 
 def shortened(path, steps):
@@ -178,7 +179,7 @@ def test_the_belief_of_a_team_stands_in_the_page_with_its_honesty(finished):
     one = run.finished[-1]
     team = one.flights()[5]
     blobs = Blobs()
-    path = one.unit.episode_file(5)
+    path = one.episode_file(5)
     flight = read_flight(path, "mpc", team, one.task, blobs)
     tables = {channel.name: decode(channel, blobs.texts()[channel.blob]) for channel in flight.channels}
     with np.load(path) as arrays:
@@ -251,7 +252,7 @@ def test_one_flight_of_one_policy_makes_a_page(tmp_path):
 
 def test_ten_thousand_flights_make_a_page_below_3_mb(copied):
     run = read_run(copied)
-    path = copied / "cells" / run.finished[0].unit.file_name
+    (path,) = [cell.path for cell in cells_of(copied, run.finished[0].unit)]
     cell = json.loads(path.read_text())
     record = cell["found"]["records"][0]
     cell["found"]["records"] = [record | {"seed": 5 + i} for i in range(10_000)]
@@ -297,7 +298,7 @@ def test_contenders_stand_in_the_page_where_networks_were_trained(copied):
 
 
 def test_a_run_that_is_not_complete_makes_a_page_that_says_so(copied):
-    sorted((copied / "cells").iterdir())[0].unlink()
+    cells_of(copied, read_run(copied).finished[0].unit)[0].path.unlink()
     report = build_report(read_run(copied))
     assert "4 of 5 units" in report.notes[0]
     assert report.environments[0].base == EVIL  # the base of the suite has not been flown there

@@ -14,6 +14,7 @@ import pytest
 from baselines import run_benchmark
 from baselines.report import Choice, render_report
 from baselines.sweeps.folder import read_run
+from baselines.sweeps.store import cells_of
 
 pytestmark = pytest.mark.slow
 
@@ -483,12 +484,12 @@ def test_a_flight_that_ended_in_its_first_step_is_shown(show, folder, tmp_path):
     shutil.copytree(folder, copy)
     run = read_run(copy)
     one = run.finished[0]
-    path = one.unit.episode_file(0)
+    path = one.episode_file(0)
     with np.load(path) as file:
         arrays = {key: file[key] for key in file.files}
     rows = {"states": 2, "references": 2, "fallbacks": None}
     np.savez(path, **{key: value[: rows.get(key, 1)] for key, value in arrays.items()})
-    cell_path = copy / "cells" / one.unit.file_name
+    (cell_path,) = [cell.path for cell in cells_of(copy, one.unit)]
     cell = json.loads(cell_path.read_text())
     cell["found"]["records"][0] |= {"crashed": True, "steps": 1}
     cell_path.write_text(json.dumps(cell))

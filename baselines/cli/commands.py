@@ -231,7 +231,7 @@ def benchmark_suite(options: BenchmarkOptions) -> int:
     def on_unit(count: int, total: int) -> None:
         nonlocal finished
         if finished < 0 and suite.learned:  # all is checked, and nothing begun
-            say(budget_of(suite).said(options.jobs))
+            say(budget_of(suite).said(options.jobs or 1))
         finished = count
         raise_lost()
 
@@ -269,7 +269,7 @@ def _resume(options: BenchmarkOptions, out: Path) -> str:
         words += [] if value is None else [f"--{name} {value}"]
     words += [f"--policy {shlex.quote(name)}" for name in options.policy]
     words += [f"--engine {options.engine}"] if options.engine != "processes" else []
-    words += [f"--jobs {options.jobs}"] if options.jobs != 1 else []
+    words += [f"--jobs {options.jobs}"] if options.jobs is not None else []
     words += [f"--only {shlex.quote(name)}" for name in options.only]
     words += ["--quick"] if options.quick else []
     words += [f"--networks {shlex.quote(str(options.networks))}"] if options.networks else []

@@ -21,6 +21,7 @@ EXTRAS = {
     "exact": ("casadi",),
     "lmi": ("cvxpy", "clarabel"),
     "ray": ("ray",),
+    "dask": ("distributed",),
 }
 _NEEDED = ("numpy", "scipy", "numba", "gymnasium", "pettingzoo", "osqp", "joblib", "tqdm")
 _GENERIC = ("controllers", "baselines")  # names that another distribution may bring, too

@@ -73,7 +73,7 @@ class BenchmarkOptions:
     episodes: Annotated[int | None, "flights per environment and policy, instead of the suite's"] = None
     seed: Annotated[int | None, "environment seed of the first flight, instead of the suite's"] = None
     engine: Annotated[str, "who runs the units: processes, ray or dask"] = "processes"
-    jobs: Annotated[int, "units flown at a time"] = 1
+    jobs: Annotated[int | None, "units flown at a time; 1, or all that a cluster has, if not given"] = None
     fresh: Annotated[bool, "discard what the folder holds of an earlier run, but for networks"] = False
     networks: Annotated[
         Path | None, "where networks and tuned policies that the suite makes are or go; OUT/networks"

@@ -22,12 +22,12 @@ def require_episodes(what: str, value: Any) -> None:
     require_whole(what, value, 1, MOST_EPISODES, lambda n: n * _EPISODE_BYTES)
 
 
-def require_jobs(value: Any) -> None:
-    """Check a number of processes.
+def require_jobs(value: Any, here: bool = True) -> None:
+    """Check a number of processes, on this machine (`here`) or on a cluster.
 
     Raises:
         ValueError: If it is not a whole number >= 1, or this machine has not the memory for them.
     """
     require_whole("jobs", value, 1, _MOST_JOBS, lambda n: n * _JOB_BYTES)
-    if value > 1:
+    if here and value > 1:
         require_memory(f"{value} processes", value * _JOB_BYTES, "choose fewer jobs")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -125,6 +125,18 @@ class Evaluation:
         times = {name: tuple(map(read, plain[name])) for name in ("decision_ms", "team_ms")}
         return cls(**{**plain, **times, "records": tuple(map(read_record, plain["records"]))})
 
+    @classmethod
+    def joined(cls, parts: Sequence[Evaluation], starts: range) -> Evaluation:
+        """One evaluation of what several found of the same policy in the same environment.
+
+        Args:
+            parts: Each of some starts.
+            starts: Those that are wanted, by their seeds. Decision times are those of the first part.
+        """
+        parts = sorted(parts, key=lambda part: part.seed)
+        records = tuple(record for part in parts for record in part.records if record.seed in starts)
+        return replace(parts[0], seed=starts.start, records=records)
+
     def __str__(self) -> str:
         return str(self._table())
 
@@ -194,7 +206,7 @@ def fly_and_measure(
     gives one record per vehicle and flight; means and intervals are over flights.
 
     The arguments are those of `baselines.evaluate`. `timed` are decision times that `time_decisions` has
-    found; None to find them now, where flights go side by side.
+    found, or none; None to find them now, where flights go side by side.
 
     Raises:
         ValueError: If the id or the policy's name is unknown, episodes < 1, or as `run_episodes` says.
@@ -216,7 +228,7 @@ def fly_and_measure(
             times.append(episode.decision_times.astype(np.float32))
         if on_episode is not None:
             on_episode(episode)
-    seconds = np.concatenate(times if timed is None else timed, dtype=np.float64)
+    seconds = np.concatenate([np.zeros(0), *(times if timed is None else timed)], dtype=np.float64)
     task: BaseTask = env.unwrapped.task
     return Evaluation(
         env_id=task.env_id,

@@ -53,12 +53,12 @@ def run_benchmark(request: BenchmarkRequest) -> Results:
     whose code may have changed. The folder gets a report.html. Decision times of policies that fly
     one flight at a time, see `evaluate`, mean something with jobs = 1, or idle cores.
 
-    A policy from outside that cannot be made, or breaks off, ends its own units only: a warning says so at
-    once, and `Results.failures` in the end.
+    What goes wrong in a unit ends this unit only: a warning says so at once, and `Results.failures` in the
+    end. A process that dies is replaced, and what it was at is tried again.
 
     Raises:
         ValueError: If the suite, the engine or an option is not valid; before anything is flown.
-        PolicyError: If nothing but policies from outside was to be flown, and all of them broke off.
+        PolicyError: If everything that was to be flown broke off.
         ResultsError: If the folder is in use, holds another suite, or cannot be written.
     """
     suite, given = _with_policies(load_suite(request.suite), request.policies or {})
@@ -87,7 +87,8 @@ def fly_suite(
 ) -> Results:
     """`run_benchmark` where some policies, by their titles, are objects."""
     check_engine(order.engine)
-    require_jobs(order.jobs)
+    if order.jobs is not None:
+        require_jobs(order.jobs, here=order.engine == "processes")
     require_disjoint_starts(suite)
     _refuse_no_folder(suite, out, order)
     failed = _refuse_bad_units(suite, given)

@@ -98,11 +98,11 @@ class _Packer:
 
     def _read(self, one: Finished, flights: Mapping[int, list[Record]], seed: int) -> Flight | None:
         """A flight; None if it was not saved, or cannot be read, which is noted."""
-        path = one.unit.episode_file(seed)
-        if seed not in flights or path is None:
+        if seed not in flights:
             return None
+        path, title = one.episode_file(seed), one.unit.policy.title
         try:
-            return read_flight(path, one.unit.policy.title, flights[seed], one.task, self.blobs, self.stride)
+            return read_flight(path, title, flights[seed], one.task, self.blobs, self.stride)
         except BadFlightError as error:
             self.bad[str(error)] = None
             return None

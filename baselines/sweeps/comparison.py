@@ -23,11 +23,11 @@ _INTERVAL = Column("", "", "half width of its 95 % interval", printed="+-", name
 
 
 class Failure(NamedTuple):
-    """A policy from outside that did not fly in an environment."""
+    """A policy that did not fly in an environment."""
 
     env: str  # title
     policy: str  # title
-    message: str  # names the policy and the line of its file
+    message: str  # what went wrong; of a policy from outside it names the line of its file
 
     def __str__(self) -> str:
         return f"{self.policy} did not fly in {self.env}: {self.message}"
@@ -39,7 +39,7 @@ class Results:
 
     suite: Suite
     evaluations: tuple[Evaluation, ...]  # one per unit of `flown`
-    trainings: tuple[Mapping[str, Any], ...] = ()  # one per network that was trained, see `training_units`
+    trainings: tuple[Mapping[str, Any], ...] = ()  # one per unit of `training_units`; empty if it failed
     failures: tuple[Failure, ...] = ()
 
     def flown(self) -> list[Unit]:
@@ -120,7 +120,10 @@ class Results:
         if self.suite.protocol:
             found["protocol"] = protocol_facts(self.suite)
         if self.suite.learned:
-            found |= {"contenders": plain_json(self.contender_rows()), "trainings": self.trainings}
+            found |= {
+                "contenders": plain_json(self.contender_rows()),
+                "trainings": [one for one in self.trainings if one],
+            }
         return found
 
     def __str__(self) -> str:

@@ -94,14 +94,14 @@ def _policies(env_id: str) -> list[str]:
 
 def _unit(env_id: str, policy: str) -> Unit:
     """A flight as anybody flies it: a shorter one may have arguments of other types."""
-    return Unit(0, EnvChoice(env_id), PolicyChoice(policy), policy, 1, 0, None)
+    return Unit(0, EnvChoice(env_id), PolicyChoice(policy), policy, 1, 0)
 
 
 def _short(unit: Unit) -> Unit:
     """One flight of a few control periods, of which nothing is saved."""
     kwargs = {key: value for key, value in unit.env.kwargs.items() if key != "max_episode_steps"}
     env = replace(unit.env, kwargs={**kwargs, "time_limit": _FEW_SECONDS})
-    return unit._replace(env=env, episodes=1, episode_folder=None)
+    return unit._replace(env=env, episodes=1)
 
 
 def _pieces(units: Sequence[Unit]) -> list[Piece]:

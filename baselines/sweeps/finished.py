@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from ..errors import CheckpointError
@@ -85,6 +87,25 @@ def train_unit(unit: TrainingUnit) -> dict[str, Any]:
         fresh = (unit.folder / "config.json").exists() and not go_on
         found = run_training(replace(_request(unit), resume=go_on, fresh=fresh))
     return found.to_dict()
+
+
+def begun(unit: TrainingUnit) -> bool:
+    """Whether its folder holds something to go on with."""
+    return (unit.folder / "config.json").exists()
+
+
+def train_elsewhere(unit: TrainingUnit) -> dict[str, Any]:
+    """`train_unit` on a machine that has not the folder, from the beginning.
+
+    Returns:
+        "training", as `train_unit` gives it, and "files", the content of the folder by relative names.
+    """
+    with TemporaryDirectory() as home:
+        folder = Path(home, unit.folder.name)
+        training = train_unit(unit._replace(folder=folder)) | {"folder": str(unit.folder)}
+        paths = [path for path in folder.rglob("*") if path.is_file() and not path.name.startswith(".")]
+        files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
+    return {"training": training, "files": files}
 
 
 def _finished(unit: TrainingUnit, plan: Plan) -> TrainingResult | None:

@@ -18,6 +18,7 @@ from baselines.sweeps.choices import EnvChoice, PolicyChoice
 from baselines.sweeps.comparison import Results
 from baselines.sweeps.contenders import Contender, contender_of
 from baselines.sweeps.protocol import check_stored
+from baselines.sweeps.store import EPISODES, cells_of, read_cell
 from baselines.sweeps.suite import BEST_MPC, Suite
 from baselines.sweeps.units import Unit, suite_units
 from quad_envs.constraints import TOLERANCE
@@ -32,6 +33,11 @@ class Finished(NamedTuple):
     evaluation: Evaluation
     task: dict[str, Any]
     flights_saved: int  # the first ones
+    episodes: Path  # their folder
+
+    def episode_file(self, seed: int) -> Path:
+        """Where a flight is, if it was saved."""
+        return self.episodes / self.unit.episode_name(seed)
 
     def flights(self) -> dict[int, list[Record]]:
         """Seeds whose flight was saved -> records of its vehicles."""
@@ -140,12 +146,10 @@ def read_run(folder: Path) -> Run:
     except (KeyError, TypeError, ValueError) as error:
         raise ResultsError(f"the suite in {str(folder / 'config.json')!r} is not valid: {error}") from error
     check_stored(folder, config, suite)
-    units = suite_units(suite, folder / "episodes", suite.episodes)
-    finished = tuple(
-        _finished(unit, folder / "cells" / unit.file_name)
-        for unit in units
-        if (folder / "cells" / unit.file_name).exists()
-    )
+    units = suite_units(suite, suite.episodes)
+    stored = [(unit, [cell.path for cell in cells_of(folder, unit)]) for unit in units]
+    read = (_finished(unit, paths, folder / EPISODES) for unit, paths in stored if paths)
+    finished = tuple(one for one in read if one.evaluation.flights == suite.episodes)  # others are under way
     if not finished:
         raise ResultsError(
             f"nothing in {str(folder)!r} is finished yet; run the same command again: it "
@@ -196,13 +200,9 @@ def _check_format(folder: Path, config: Any) -> None:
         )
 
 
-def _finished(unit: Unit, path: Path) -> Finished:
-    """What a cell says of a unit."""
-    cell = read_json(path)
-    try:
-        found = Evaluation.from_plain(cell["found"])
-        return Finished(unit, found, dict(cell["task"]), int(cell["flights_saved"]))
-    except (KeyError, TypeError, AttributeError) as error:
-        raise ResultsError(
-            f"{str(path)!r} is not a finished unit ({error!r}); delete it to fly this unit again"
-        ) from error
+def _finished(unit: Unit, paths: Sequence[Path], episodes: Path) -> Finished:
+    """What the cells of a unit say."""
+    blocks = [read_cell(path) for path in paths]
+    found = Evaluation.joined([block.found for block in blocks], unit.starts)
+    saved = sum(block.flights_saved for block in blocks)
+    return Finished(unit, found, blocks[0].task, saved, episodes)

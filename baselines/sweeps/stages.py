@@ -28,8 +28,9 @@ class SweepProgress:
     def __init__(self) -> None:
         self._train: Progress | None = None
         self._fly: Progress | None = None
-        self._left = 0  # units
+        self._left = 0  # blocks
         self._all = self._flown = 0.0  # price of what is to be flown, and of what is
+        self._said = ""  # the time left
 
     def trained(self, finished: int, total: int) -> None:
         """So many of the networks are there; each takes about as long as another."""
@@ -42,26 +43,30 @@ class SweepProgress:
             self._train.close()
 
     def ready(self, left: Sequence[Unit]) -> None:
-        """All is checked, and networks are trained: these units are going to fly."""
+        """All is checked, and networks are trained: these blocks are going to fly."""
         compile_for(left)
-        self._all = sum(map(price, left))
+        self._all = sum(price(block) * block.episodes for block in left)
         self._left, self._fly = len(left), Progress("fly", len(left))
 
-    def flown(self, unit: Unit, found: Evaluation) -> None:
-        """The row of a unit that was flown just now."""
+    def moved(self, block: Unit) -> None:
+        """A block was flown just now."""
         assert self._fly is not None
-        self._flown += price(unit)
+        self._flown += price(block) * block.episodes
         self._left -= 1
-        left = self._fly.move(self._flown, self._all)
+        self._said = self._fly.move(self._flown, self._all)
+        if not self._left:
+            self.close()
+
+    def flown(self, unit: Unit, found: Evaluation) -> None:
+        """The row of a unit that is complete."""
+        assert self._fly is not None
         summary = found.summary()
         crashes = sum(record.crashed for record in found.records)
         self._fly.write(
             f"{unit.env.title}  {unit.policy.title:22} score {summary['score'].mean:.3f}  "
             f"violating {100.0 * summary['violation_share'].mean:3.0f} %  crashed {crashes:2}  "
-            f"decision {found.decision_ms[0]:.3f} ms  {left}"
+            f"decision {found.decision_ms[0]:.3f} ms  {self._said}"
         )
-        if not self._left:
-            self.close()
 
     def close(self) -> None:
         """Take the bar away, also where the sweep was interrupted."""

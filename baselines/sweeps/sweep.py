@@ -8,29 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from ..errors import PolicyError, ResultsError
+from ..errors import PolicyError
 from ..evaluation.evaluate import Evaluation
-from ..files import (
-    FAILURES,
-    RESULTS_FORMAT,
-    discard,
-    plain_json,
-    provenance,
-    read_json,
-    refuse_foreign,
-    source_digest,
-    write_csv,
-    write_json,
-)
-from ..policies.registry import from_outside
+from ..files import FAILURES, discard, locked, write_atomic, write_csv, write_json
 from .comparison import Failure, Results
 from .engines import run_units
-from .finished import train_unit
-from .protocol import protocol_facts, refuse_other_version
+from .finished import begun, train_elsewhere, train_unit
+from .inputs import read_files
 from .stages import price
+from .store import Store, blocks_left
 from .suite import Suite
 from .unit_flights import fly_unit, timed_unit
-from .units import Given, Unit, suite_units, training_units
+from .units import Given, TrainingUnit, Unit, suite_units, training_units
 
 REPORTED = 2  # flights of each unit that are saved for the report where not all are asked for
 
@@ -42,10 +31,13 @@ class Watcher(Protocol):
         """So many of the networks are there; called before the first, too, if there are any."""
 
     def ready(self, left: Sequence[Unit]) -> None:
-        """All is checked, and networks are trained: these units are going to fly."""
+        """All is checked, and networks are trained: these blocks of flights are going to fly."""
+
+    def moved(self, block: Unit) -> None:
+        """A block of flights was flown just now, here or elsewhere."""
 
     def flown(self, unit: Unit, found: Evaluation) -> None:
-        """A unit was flown just now, or came from another process."""
+        """With this block, all of a unit is flown."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,7 +45,7 @@ class Order:
     """How a suite is to be flown; the comment of a field is its documentation everywhere."""
 
     engine: str = "processes"  # or "ray" or "dask"
-    jobs: int = 1  # units flown at a time
+    jobs: int | None = None  # units flown at a time; one here, all that a cluster has, if not given
     save_episodes: bool = (
         False  # whether to write every flight to out/episodes, and not only the first REPORTED of each unit,
         # which the report shows
@@ -87,51 +79,113 @@ class Sweep:
     ) -> None:
         self.suite, self.failed, self.folder, self.order = suite, failed, folder, order
         home = Path(order.networks or (folder or Path()) / "networks").absolute()
-        all_flights = order.save_episodes
-        episodes = None if folder is None else folder / "episodes"
         self.to_train = training_units(suite, home)
-        units = suite_units(suite, episodes, suite.episodes if all_flights else REPORTED, home)
-        self.units = with_given(units, given)
+        saved = 0 if folder is None else suite.episodes if order.save_episodes else REPORTED
+        self.units = with_given(suite_units(suite, saved, home), given)
         if folder is not None and order.fresh:
             discard(folder)
-        self.flown = _begin(folder, suite, self.units, all_flights)  # cells by the number of their unit
+        self.store = Store(folder, suite, order.save_episodes)
+        self.parts: dict[int, list[Evaluation]] = {}  # blocks that are flown, by the number of their unit
+        self.flown: dict[int, Evaluation] = {}  # whole units
         self.trained: dict[int, dict[str, Any]] = {}
 
     def go(self) -> None:
-        """Train, then fly what is left; each flown unit is stored at once."""
-        engine, jobs = self.order.engine, self.order.jobs
-        report = self.order.on_unit or (lambda finished, total: None)
-        total = len(self.to_train) + len(self.units)
-        left = [unit for unit in self.units if not (unit.number in self.flown or unit.number in self.failed)]
-        report(self.done, total)
+        """Train, then fly what is left; each block of flights is stored at once."""
+        self._report()
         for number in self.failed:
             self._warn(number)
-        watcher = self.order.watcher
-        if watcher is not None and self.to_train:
-            watcher.trained(0, len(self.to_train))
-        for number, training in run_units(train_unit, self.to_train, engine, jobs):
-            self.trained[number] = training
-            report(self.done, total)
-            if watcher is not None:
-                watcher.trained(len(self.trained), len(self.to_train))
-        if jobs == 1:  # in parallel the long ones would be left over in the end
-            places = {unit.env.title: i for i, unit in reversed(list(enumerate(left)))}
-            left.sort(key=lambda unit: (places[unit.env.title], price(unit)))
+        self._train()
+        blocks = self._left()
+        self._report()
+        watcher, engine, jobs = self.order.watcher, self.order.engine, self.order.jobs
+        alone = engine == "processes" and (jobs or 1) == 1
+        if alone:  # in parallel the long ones would be left over in the end
+            places = {block.env.title: i for i, (_, block) in reversed(list(enumerate(blocks)))}
+            blocks.sort(key=lambda one: (places[one[1].env.title], price(one[1])))
         if watcher is not None:
-            watcher.ready(left)
-        if jobs > 1:  # before others take the cores
-            left = [timed_unit(unit) for unit in left]
-        for number, cell in run_units(fly_unit, left, engine, jobs):
-            if "failure" in cell:
-                self.failed[number] = cell["failure"]
-                self._warn(number)
+            watcher.ready([block for _, block in blocks])
+        if not alone:  # before others take the cores
+            blocks = [(unit, timed_unit(block) if block.timed is None else block) for unit, block in blocks]
+        if engine != "processes":
+            blocks = [(unit, block._replace(files=read_files(block))) for unit, block in blocks]
+        numbered = [block._replace(number=i) for i, (_, block) in enumerate(blocks)]
+        for i, flown in run_units(fly_unit, numbered, engine, jobs):
+            unit, block = blocks[i]
+            if "failure" in flown:
+                self._fail(unit.number, flown["failure"])
             else:
-                if self.folder is not None:
-                    write_json(self.folder / "cells" / self.units[number].file_name, cell)
-                self.flown[number] = cell
-            report(self.done, total)
-            if watcher is not None and number in self.flown:
-                watcher.flown(self.units[number], Evaluation.from_plain(cell["found"]))
+                self.store.keep(unit, block, flown)
+                self._add(unit, Evaluation.from_plain(flown["cell"]["found"]))
+            self._report()
+            if watcher is not None:
+                watcher.moved(block)
+                if unit.number in self.flown:
+                    watcher.flown(unit, self.flown[unit.number])
+
+    def _train(self) -> None:
+        watcher, count = self.order.watcher, len(self.to_train)
+        if watcher is not None and self.to_train:
+            watcher.trained(0, count)
+        for number, training in self._trainings():
+            if "failure" in training:
+                self._lose(self.to_train[number], training["failure"])
+                continue
+            self.trained[number] = training
+            self._report()
+            if watcher is not None:
+                watcher.trained(len(self.trained), count)
+
+    def _trainings(self) -> Iterator[tuple[int, dict[str, Any]]]:
+        """Networks as they are there; those of a cluster come with all their files."""
+        engine, jobs = self.order.engine, self.order.jobs
+        if engine == "processes":
+            yield from run_units(train_unit, self.to_train, engine, jobs)
+            return
+        here = [unit for unit in self.to_train if begun(unit)]
+        yield from run_units(train_unit, here, "processes", 1)
+        away = [unit for unit in self.to_train if unit not in here]
+        for number, done in run_units(train_elsewhere, away, engine, jobs):
+            if "failure" in done:
+                yield number, done
+                continue
+            with locked(self.to_train[number].folder):
+                for name, content in done["files"].items():
+                    write_atomic(self.to_train[number].folder / name, content)
+            yield number, done["training"]
+
+    def _left(self) -> list[tuple[Unit, Unit]]:
+        """Units, and blocks of their flights that are not stored."""
+        left = []
+        for unit in self.units:
+            if unit.number not in self.failed:
+                stored = self.store.found(unit)
+                for part in stored:
+                    self._add(unit, part)
+                left += [(unit, block) for block in blocks_left(unit, stored)]
+        return left
+
+    def _add(self, unit: Unit, part: Evaluation) -> None:
+        """A block is there; with the last one its unit is whole."""
+        parts = self.parts.setdefault(unit.number, [])
+        parts.append(part)
+        if sum(one.flights for one in parts) >= unit.episodes:
+            self.flown[unit.number] = Evaluation.joined(parts, unit.starts)
+
+    def _report(self) -> None:
+        if self.order.on_unit is not None:
+            self.order.on_unit(self.done, len(self.to_train) + len(self.units))
+
+    def _lose(self, training: TrainingUnit, why: str) -> None:
+        """Nothing flies that needs this network."""
+        for unit in self.units:
+            if unit.policy is training.policy and unit.policy_name == str(training.folder):
+                self._fail(unit.number, f"its network could not be trained: {why}")
+
+    def _fail(self, number: int, why: str) -> None:
+        """A unit is not to be had; of one in several blocks this is said once."""
+        if number not in self.failed:
+            self.failed[number] = why
+            self._warn(number)
 
     def _warn(self, number: int) -> None:
         """Say at once, and not only in the end, that one of several units broke off."""
@@ -157,8 +211,8 @@ class Sweep:
             raise PolicyError(failures[0].message)
         results = Results(
             self.suite,
-            tuple(Evaluation.from_plain(self.flown[unit.number]["found"]) for unit in flown),
-            tuple(self.trained[unit.number] for unit in self.to_train),
+            tuple(self.flown[unit.number] for unit in flown),
+            tuple(self.trained.get(unit.number, {}) for unit in self.to_train),
             failures,
         )
         if self.folder is not None:
@@ -175,49 +229,3 @@ def _write_tables(folder: Path, results: Results) -> None:
         write_json(folder / FAILURES, [failure._asdict() for failure in results.failures])
     if results.suite.learned:
         write_csv(folder / "contenders.csv", results.contender_rows())
-
-
-def _begin(
-    folder: Path | None, suite: Suite, units: Sequence[Unit], all_flights: bool
-) -> dict[int, dict[str, Any]]:
-    """Write config.json, or check that it is this suite's; the finished units by index."""
-    if folder is None:
-        return {}
-    refuse_foreign(folder)
-    config = folder / "config.json"
-    if not config.exists():
-        facts = protocol_facts(suite)
-        said = {"format": RESULTS_FORMAT, "suite": plain_json(suite.to_dict())}
-        write_json(config, {**said, **({"protocol": facts} if facts else {}), **provenance()})
-        return {}
-    stored, asked = read_json(config), plain_json(suite.to_dict())
-    refuse_other_version(folder, stored, suite)
-    if stored.get("suite") != asked:
-        before = stored.get("suite") or {}
-        differing = ", ".join(key for key, value in asked.items() if before.get(key) != value)
-        raise ResultsError(
-            f"{str(folder)!r} holds another suite (it differs in {differing}); choose another folder, "
-            "or discard it with fresh=True (--fresh)"
-        )
-    if stored.get("source") != source_digest():
-        raise ResultsError(
-            f"{str(folder)!r} was begun with other sources, revision {stored.get('git_revision')}: their "
-            "numbers do not mix; choose another folder, or discard it with fresh=True (--fresh)"
-        )
-    return dict(_stored_units(folder, units, all_flights))
-
-
-def _stored_units(
-    folder: Path, units: Sequence[Unit], all_flights: bool
-) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Units that have their cell and, where all are asked for, every flight.
-
-    Nothing tells whether the code or the weights of a policy from outside have changed: it flies again.
-    """
-    for unit in units:
-        path = folder / "cells" / unit.file_name
-        if not unit.named or (unit.policy.made is None and from_outside(unit.source)):
-            path.unlink(missing_ok=True)
-            continue
-        if path.exists() and not (all_flights and any(not file.exists() for file in unit.episode_files())):
-            yield unit.number, read_json(path)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -19,20 +19,24 @@ from ..evaluation.episode import Episode
 from ..evaluation.evaluate import fly_and_measure
 from ..evaluation.rollout import check_flights, time_decisions
 from ..evaluation.row_forms import has_row_form
-from ..files import write_atomic
 from ..policies.environments import make_env
 from ..policies.registry import from_outside, make_policy, policy_name
 from .folder import task_facts
+from .inputs import at_hand
 from .units import Unit
 
 
 def fly_unit(unit: Unit) -> dict[str, Any]:
-    """Fly one unit; the form in which it is stored in cells/, or what went wrong as "failure".
+    """Fly one unit, or a block of its flights.
 
-    A policy from outside that breaks off is a finding of the sweep, whose other units go on.
+    Returns:
+        "cell", the form in which it is stored in cells/, and "flights", the content of each file in episodes/
+        by its name; or what went wrong as "failure". A policy from outside that breaks off is a finding of
+        the sweep, whose other units go on.
     """
     try:
-        return _fly(unit)
+        with at_hand(unit) as (here, places):
+            return _fly(here, places)
     except ResultsError:
         raise
     except ValueError as error:
@@ -65,15 +69,16 @@ def _made(unit: Unit) -> tuple[Any, Any]:
     return env, make_policy(unit.source, env, **unit.options)
 
 
-def _fly(unit: Unit) -> dict[str, Any]:
+def _fly(unit: Unit, places: Mapping[str, str]) -> dict[str, Any]:
     begin = perf_counter()
     env, policy = _made(unit)
-    save = None if unit.episode_folder is None else _saver(unit, env)
+    flights: dict[str, bytes] = {}
+    save = _saver(unit, env, flights)
 
     def on_episode(episode: Episode) -> None:
-        for hear in (save, unit.given.on_episode):
-            if hear is not None:
-                hear(episode)
+        save(episode)
+        if unit.given.on_episode is not None:
+            unit.given.on_episode(episode)
 
     found = fly_and_measure(
         policy,
@@ -85,34 +90,37 @@ def _fly(unit: Unit) -> dict[str, Any]:
         timed=unit.timed,
     )
     if unit.given.policy is None:
-        found = replace(found, policy=policy_name(policy, unit.policy_name))
+        name = policy_name(policy, unit.policy_name)
+        for text, place in places.items():
+            name = name.replace(place, text)
+        found = replace(found, policy=name)
     if unit.given.env is None:
         env.close()
     seconds = perf_counter() - begin
-    return {
+    cell = {
         "env": unit.env.title,
         "policy": unit.policy.title,
         "seconds": seconds,
         "task": task_facts(env.unwrapped.task),
-        "flights_saved": len(unit.episode_files()),
+        "flights_saved": len(flights),
         "found": found.to_plain(),
     }
+    return {"cell": cell, "flights": flights}
 
 
-def _saver(unit: Unit, env: Any) -> Callable[[Episode], None]:
-    """Writes the flights that are wanted to episodes/, each when all vehicles of a team have given theirs."""
+def _saver(unit: Unit, env: Any, flights: dict[str, bytes]) -> Callable[[Episode], None]:
+    """Adds the flights that are wanted, each when all vehicles of a team have given theirs."""
     team: list[Episode] = []
 
     def save(episode: Episode) -> None:
         team.append(episode)
         if len(team) < episode.team_size:
             return
-        path = unit.episode_file(episode.seed)
-        if path is not None:
+        if episode.seed < unit.save_before:
             arrays: dict[str, Any] = flight_arrays(team) | _graphs(env)
             buffer = io.BytesIO()
             np.savez_compressed(buffer, **arrays)
-            write_atomic(path, buffer.getvalue())
+            flights[unit.episode_name(episode.seed)] = buffer.getvalue()
         team.clear()
 
     return save

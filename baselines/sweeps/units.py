@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -51,15 +52,20 @@ class Unit(NamedTuple):
     policy_name: str  # for make_policy
     episodes: int
     seed: int
-    episode_folder: Path | None  # where to save flights
-    flights_saved: int = 0  # how many, the first ones
+    save_before: int = 0  # flights from starts below this seed are saved
     given: Given = Given()
     timed: tuple[Array, ...] | None = None  # its decisions, where they were timed before the flights
+    files: Mapping[str, Mapping[str, bytes]] | None = None  # brought to another machine, see `inputs`
 
     @property
     def named(self) -> bool:
         """Whether names alone say what is flown, so that a stored result stands for it."""
         return all(value is None or value is False for value in self.given)
+
+    @property
+    def starts(self) -> range:
+        """Seeds of its flights."""
+        return range(self.seed, self.seed + self.episodes)
 
     @property
     def source(self) -> Any:
@@ -72,29 +78,24 @@ class Unit(NamedTuple):
         return {} if self.policy.made is not None else self.policy.kwargs
 
     @property
-    def file_name(self) -> str:
-        """Name of its file in cells/."""
-        return f"{self.number:03d}-{_slug(f'{self.env.title}--{self.policy.title}')}.json"
+    def name(self) -> str:
+        """Its name in file names: readable, and another one for other titles."""
+        return _file_name(f"{self.env.title}--{self.policy.title}")
 
-    def episode_file(self, seed: int) -> Path | None:
-        """File of the flight with a seed; None if it is not saved."""
-        if self.episode_folder is None or seed >= self.seed + self.flights_saved:
-            return None
-        return self.episode_folder / f"{self.file_name.removesuffix('.json')}-{seed}.npz"
-
-    def episode_files(self) -> list[Path]:
-        """Files of its flights that are saved."""
-        files = (self.episode_file(self.seed + i) for i in range(self.episodes))
-        return [file for file in files if file is not None]
+    def episode_name(self, seed: int) -> str:
+        """Name of the file of a flight that is saved."""
+        return f"{self.name}-{seed}.npz"
 
 
-def _slug(text: str) -> str:
-    return "".join(c if c.isalnum() else "-" for c in text)[:80]
+def _file_name(text: str) -> str:
+    """A text as a part of file names; its digest tells apart what differs in other characters only."""
+    slug = "".join(c if c.isascii() and c.isalnum() else "-" for c in text)[:80]
+    return f"{slug}-{hashlib.sha256(text.encode()).hexdigest()[:6]}"
 
 
 def _trained_folder(env: EnvChoice, policy: PolicyChoice, networks: Path) -> Path:
     """Where the network of a policy for an environment is."""
-    return networks / _slug(f"{env.title}--{policy.title}")
+    return networks / _file_name(f"{env.title}--{policy.title}")
 
 
 def training_units(suite: Suite, networks: Path = Path("networks")) -> list[TrainingUnit]:
@@ -115,7 +116,6 @@ def training_units(suite: Suite, networks: Path = Path("networks")) -> list[Trai
 
 def suite_units(
     suite: Suite,
-    episodes: Path | None = None,
     flights_saved: int = 0,
     networks: Path = Path("networks"),
 ) -> list[Unit]:
@@ -123,8 +123,7 @@ def suite_units(
 
     Args:
         suite: The suite.
-        episodes: Folder in which flights are saved; None if they are not.
-        flights_saved: How many of each unit, the first ones.
+        flights_saved: How many of each unit are saved, the first ones.
         networks: Folder of what the suite trains or tunes.
     """
     units: list[Unit] = []
@@ -134,7 +133,7 @@ def suite_units(
                 if policy.conditions and condition not in policy.conditions:
                     continue
                 name, number = _policy_name(env, policy, networks), len(units)
-                flights = suite.episodes, suite.seed, episodes, flights_saved
+                flights = suite.episodes, suite.seed, suite.seed + flights_saved
                 units.append(Unit(number, flown, policy, name, *flights))
     return units
 

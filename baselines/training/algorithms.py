@@ -5,7 +5,8 @@
 `task_options` are the TrackingOptions or team options of the environment, `options` the algorithm's
 hyperparameters (a frozen dataclass), `spent()` the share of the budget that is used up: the generator ends at
 1, and yields after each update. `start` is a network to go on from, for --resume; a generator without this
-argument cannot be resumed.
+argument cannot be resumed. `check(task_options, options, start)` in its module, if there is one, refuses what
+the generator would, before anything is written.
 """
 
 from __future__ import annotations
@@ -134,6 +135,23 @@ def generator_of(name: str) -> Callable[..., Any]:
     entry = ALGORITHMS[name]
     found: Callable[..., Any] = getattr(import_module(entry.module, __package__), entry.generator)
     return found
+
+
+def check_training(name: str, task_options: Any, options: Any, start: Any) -> None:
+    """Refuse what an algorithm would refuse once it trains, as far as it can tell before.
+
+    Args:
+        name: Of the algorithm.
+        task_options: Of the environment.
+        options: Hyperparameters.
+        start: Network to go on from, or None.
+
+    Raises:
+        ValueError: If it would.
+    """
+    check = getattr(import_module(ALGORITHMS[name].module, __package__), "check", None)
+    if check is not None:
+        check(task_options, options, start)
 
 
 def options_of(name: str) -> type[Any]:

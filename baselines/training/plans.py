@@ -13,7 +13,7 @@ from ..policies.checkpoints import load_checkpoint
 from ..policies.network import Network
 from ..policies.trained import checkpoint_folder
 from .algorithm_options import check_sizes
-from .algorithms import algorithm_for, require_packages, require_resumable
+from .algorithms import algorithm_for, check_training, require_packages, require_resumable
 from .clock import Budget
 from .held_out import Point, read_point, training_options
 from .hyperparameters import hyperparameters, plain_options
@@ -81,6 +81,7 @@ def make_plan(request: TrainingRequest) -> Plan:
     check_sizes(options, task_options.task.layout.size)
     source = request.start_from
     network, origin = (None, None) if source is None else _origin(source, algorithm)
+    check_training(algorithm, task_options, options, network)
     made_by = replace(request, env_id=env_id, seconds=budget.seconds, out=None, resume=False)
     about = {
         "env_id": env_id,

@@ -24,11 +24,12 @@ from quad_envs.observations.features import Features
 from ..errors import TrainingError
 from ..policies.network import Floats, Network, Squash
 from .algorithm_options import PolicyGradientOptions
+from .beginning import require_continuable
 from .differentiable import Flights, S
 from .features import require_plain, training_features
 from .flights import DifferentiableFlights
 from .held_out import Progress
-from .team_flights import DifferentiableTeams
+from .team_flights import DifferentiableTeams, require_differentiable
 
 
 class Actor:
@@ -69,19 +70,8 @@ class Actor:
         """
         import torch
 
-        shapes = [tuple(layer.weight.shape[::-1]) for layer in self.layers]
-        kinds = (network.squash, network.activation, str(network.command_range))
-        own = (self.squash, "tanh", "1.0")
-        if [W.shape for W in network.weights] != shapes or kinds != own:
-            raise ValueError(
-                f"cannot go on from layers {[W.shape for W in network.weights]} ({', '.join(kinds)}) with "
-                f"layers {shapes} ({', '.join(own)}): give the same net_arch and squash"
-            )
-        if network.features != features:
-            raise ValueError(
-                "cannot go on from a network that sees other features, or scales them otherwise: begin with "
-                "one of the same task, preview and stages"
-            )
+        *hidden, outputs = [layer.out_features for layer in self.layers]
+        require_continuable(network, features, tuple(hidden), outputs, self.squash)
         with torch.no_grad():
             for layer, W, b in zip(self.layers, network.weights, network.biases, strict=True):
                 layer.weight.copy_(torch.from_numpy(W.T.copy()))
@@ -132,27 +122,40 @@ def _window_gradient(
     return float(np.mean([record.rewards for record in records]))
 
 
+def check(
+    task_options: TrackingOptions | TeamOptions, options: PolicyGradientOptions, start: Network | None = None
+) -> None:
+    """Refuse what `train` would, before anything is written.
+
+    Raises:
+        ValueError: If the task cannot be differentiated, a hyperparameter is for the other kind of task, or
+            training cannot go on from `start`.
+    """
+    if isinstance(task_options, TeamOptions):
+        require_differentiable(task_options, options.separation)
+        require_plain(task_options, options.disturbance_estimate, options.heading_axes)
+    else:
+        for name in ("stages", "separation", "episode_steps"):
+            if getattr(options, name) is not None:
+                raise ValueError(
+                    f"hyperparameter {name} = {getattr(options, name)!r} is for teams: leave it out"
+                )
+    if start is not None:
+        sees = options.disturbance_estimate, options.heading_axes
+        features = training_features(task_options, options.stages, *sees)
+        require_continuable(start, features, options.net_arch, 4, options.squash)
+
+
 def _flights_of(
     task_options: TrackingOptions | TeamOptions, options: PolicyGradientOptions, seed: int
 ) -> Flights[Any]:
-    """Flights to train in.
-
-    Raises:
-        ValueError: If the task cannot be differentiated, or a hyperparameter is for the other kind of task.
-    """
+    """Flights to train in."""
+    check(task_options, options)
     if isinstance(task_options, TeamOptions):
-        require_plain(task_options, options.disturbance_estimate, options.heading_axes)
-        cycles = options.episode_steps or task_options.task.episode_steps
-        trained = replace(
-            task_options,
-            terminate="team",
-            substeps=options.substeps,
-            max_cycles=min(cycles, task_options.task.episode_steps),
-        )
+        longest = task_options.task.episode_steps
+        cycles = min(options.episode_steps or longest, longest)
+        trained = replace(task_options, terminate="team", substeps=options.substeps, max_cycles=cycles)
         return DifferentiableTeams(trained, options.n_envs, seed, options.stages, options.separation)
-    for name in ("stages", "separation", "episode_steps"):
-        if getattr(options, name) is not None:
-            raise ValueError(f"hyperparameter {name} = {getattr(options, name)!r} is for teams: leave it out")
     flown = replace(task_options, substeps=options.substeps)
     features = training_features(flown, None, options.disturbance_estimate, options.heading_axes)
     return DifferentiableFlights(flown, options.n_envs, seed, features)

@@ -64,12 +64,7 @@ class DifferentiableTeams:
         stages: tuple[int, ...] | None = None,
         separation: float | None = None,
     ) -> None:
-        require_differentiable(options)
-        if separation is not None and not separation >= options.separation:
-            raise ValueError(
-                f"hyperparameter separation must be at least the task's own, {options.separation:g} m, got "
-                f"{shown(separation)} m"
-            )
+        require_differentiable(options, separation)
         self._size = options.vehicles
         self.teams = max(1, n // self._size)
         self.n = self.teams * self._size
@@ -178,12 +173,21 @@ class DifferentiableTeams:
         return (commands + bar_commands * flew_on) * step.slopes, plants, previous
 
 
-def require_differentiable(options: TeamOptions) -> None:
+def require_differentiable(options: TeamOptions, separation: float | None = None) -> None:
     """Check that a policy gradient passes through a team.
+
+    Args:
+        options: Of the task.
+        separation: See `DifferentiableTeams`.
 
     Raises:
         ValueError: If not; the message names what is in its way, and the remedy.
     """
+    if separation is not None and not separation >= options.separation:
+        raise ValueError(
+            f"hyperparameter separation must be at least the task's own, {options.separation:g} m, got "
+            f"{shown(separation)} m"
+        )
     if options.reward != "bounded":
         raise ValueError(f"the analytic policy gradient needs reward='bounded', got {shown(options.reward)}")
     if options.comm == "plan":

@@ -53,6 +53,34 @@ def _without_count(typing: Any, array: Any) -> Any:
     return array(array), generate
 
 
+def _bits_of(x: float) -> np.uint64:
+    """The 64 bits of a double."""
+    return np.float64(x).view(np.uint64)
+
+
+def _number_of(bits: np.uint64) -> float:
+    """The double of 64 bits."""
+    return float(np.uint64(bits).view(np.float64))
+
+
+def _cast_to_bits(typing: Any, x: Any) -> Any:
+    """`_bits_of` without an instruction."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.IntType(64))
+
+    return types.uint64(types.float64), generate
+
+
+def _cast_to_number(typing: Any, bits: Any) -> Any:
+    """`_number_of` without an instruction."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.DoubleType())
+
+    return types.float64(types.uint64), generate
+
+
 def _in_registers(typing: Any, out: Any, start: Any, table: Any, row: Any, p: Any) -> Any:
     """`_write_stage` as four and four doubles that become eight floats."""
 
@@ -112,9 +140,13 @@ def _nearer_in_registers(typing: Any, places: Any, at: Any, x: Any, y: Any, z: A
 write_stage: Any
 take_nearer: Any
 borrowed: Any
+bits_of: Any
+number_of: Any
 if getattr(config, "DISABLE_JIT", False):
     take_nearer = _take_nearer
     write_stage, borrowed = _write_stage, _borrowed
+    bits_of, number_of = _bits_of, _number_of
 else:
     write_stage, borrowed = intrinsic(_in_registers), intrinsic(_without_count)
     take_nearer = intrinsic(_nearer_in_registers)
+    bits_of, number_of = intrinsic(_cast_to_bits), intrinsic(_cast_to_number)

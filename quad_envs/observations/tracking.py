@@ -185,20 +185,21 @@ def encode_own(
 
 
 @inline_kernel
-def encode_disturbance(out: NDArray[np.float32], start: int, step: int, disturbance: Array) -> None:
+def encode_disturbance(out: NDArray[np.float32], start: int, coming: int, disturbance: Array) -> None:
     """Write torque and force in the middle of the coming period from out[start] on; zero without any.
 
     Args:
         out: Observation, float32.
         start: Where they stand.
-        step: Control step.
-        disturbance: Table, (n_steps, n_nodes, 6).
+        coming: Control period, of which the table's last row holds on; -1 after the last one.
+        disturbance: Table, (n_steps, n_nodes, 6); no steps for none.
     """
     for i in range(6):
         out[start + i] = 0.0
-    if step < disturbance.shape[0]:
+    if coming >= 0 and disturbance.shape[0] > 0:
+        row = disturbance[min(coming, disturbance.shape[0] - 1)]
         for i in range(6):
-            out[start + i] = disturbance[step, disturbance.shape[1] // 2, i]
+            out[start + i] = row[disturbance.shape[1] // 2, i]
 
 
 @inline_kernel

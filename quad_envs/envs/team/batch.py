@@ -25,6 +25,7 @@ from ...lanes import (
     Blocks,
 )
 from ...names import nearest_name, shown, unknown_name
+from ...normals import key_of
 from ...observations.tracking import N_REFERENCE
 from ...plant import N_STATE, Array
 from ...references import make_reference, pack_rows
@@ -32,6 +33,7 @@ from ...sensors import sensor_rows
 from ...table_row import N_TABLE
 from ...targets import N_TARGET, make_target
 from ...tasks import TeamTask
+from ..shared.draws import gusts_in_flight, make_draws
 from ..shared.given import given_plants
 from ..shared.packed_batch import PackedBatch
 from ..shared.tables import checked_rows, disturbance_rows, draw_vehicle, reference_rows, stage_times
@@ -106,6 +108,7 @@ class TeamBatch(PackedBatch):
             task_vector(self.task, options.substeps, math.inf),
             _team_vector(options),
             np.zeros(scratch_size(self.n, layout.sensed)),
+            make_draws(self._disturbance, self.task, options.substeps, teams * self.n, self.vehicles.count),
         )
         self._words = pack(self._arrays)
         self._constraints = len(self.task.constraint_names)
@@ -128,18 +131,16 @@ class TeamBatch(PackedBatch):
         """What is flown, and which of it is drawn at reset."""
         options = self.options
         self._randomization = options.randomization()
-        self._noise = np.repeat(np.asarray(self.task.sensor_noise), 3)
         self._reference = make_reference(
             options.reference if isinstance(options, FormationOptions) else "setpoint"
         )
         self._disturbance = options.make_disturbance()
         self._target = make_target(options.target) if isinstance(options, TargetTrackingOptions) else None
         self._spread = options.target_spread if isinstance(options, TargetTrackingOptions) else (0.0, 0.0)
-        noisy = bool(self._noise.any())
         self._random = (
             self._reference.random,
             self._disturbance is not None and self._disturbance.random,
-            noisy,
+            max(self.task.sensor_noise) > 0.0,
             self._target is not None and (self._target.random or max(self._spread) > 0.0),
             self._target is not None or options.drop_out > 0.0,
         )
@@ -149,10 +150,12 @@ class TeamBatch(PackedBatch):
         n, teams, steps = self.n, self.teams, self.task.episode_steps
         units = (teams, teams * n, teams * n, teams, teams)
         count = [unit if random else 1 for unit, random in zip(units, self._random, strict=True)]
+        # Gusts and noise are drawn period by period.
+        blown = 1 if gusts_in_flight(self._disturbance) else steps if self._disturbance else 0
         return [
             (count[REFERENCE], steps + 1 + self.task.layout.preview, N_TABLE),
-            (count[DISTURBANCE], steps if self._disturbance else 0, 2 * self.options.substeps + 1, 6),
-            (count[NOISE], steps + 1 if self._random[NOISE] else 0, N_STATE),
+            (count[DISTURBANCE], blown, 2 * self.options.substeps + 1, 6),
+            (count[NOISE], 1 if self._random[NOISE] else 0, N_STATE),
             (count[TARGET], steps + 1 if self._target else 0, N_TARGET),
             (count[DRAW], steps + 1 if self._random[DRAW] else 0, n, 4 + self.task.layout.neighbours),
         ]
@@ -212,8 +215,8 @@ class TeamBatch(PackedBatch):
     ) -> None:
         """Begin new episodes, and write their first observations and scores.
 
-        Draws for each team, in this order: starts, vehicles, reference, disturbances, target, own sensors'
-        noise, measurement noise, detections and drop-outs.
+        Draws for each team, in this order: starts, vehicles, reference, disturbances, target, keys of gusts
+        and of own sensors' noise (a uniform number each), measurement noise, detections and drop-outs.
 
         Args:
             index: Teams, (m,).
@@ -241,15 +244,14 @@ class TeamBatch(PackedBatch):
                 self._place(*draw_vehicle(self.task, self._randomization, rng), i)
         if self._random[REFERENCE]:
             self.references[t] = reference_rows(self._reference, self._times, rng)
-        if self._disturbance is not None and self._random[DISTURBANCE]:
+        draws = self._arrays.draws
+        if self._disturbance is not None and self._random[DISTURBANCE] and not draws.gusty:
             for i in range(first, first + n):
                 self.disturbances[i] = disturbance_rows(self._disturbance, self._nodes, self.task.dt, rng)
         if self._random[TARGET]:
             self.targets[t] = self._target_rows(rng)
-        if self._random[NOISE]:
-            noises = self.noises[first : first + n]
-            rng.standard_normal(out=noises)
-            noises *= self._noise
+        if draws.gusty or draws.noisy:
+            draws.keys[first : first + n] = key_of(rng.random(n))
         if self._random[DRAW]:
             draws = self._draws[t]
             draws[..., :3] = rng.standard_normal((*draws.shape[:-1], 3))

@@ -45,6 +45,7 @@ from ...lanes import (
 )
 from ...observations.team import N_PLAN_STAGE
 from ...plant import N_INPUT, Array
+from ..shared.draws import Draws, draw_ahead
 from ..shared.task_vector import DT, HOVER, SUBSTEPS
 from ..tracking.kernel import begin_lane, command, first_unsound, substep
 from .exchange import (
@@ -96,6 +97,7 @@ class Teams(NamedTuple):
     task: Annotated[Array, "S"]  # task vector
     team: Annotated[Array, "S"]  # team vector
     scratch: Annotated[Array, "S"]  # (scratch_size,)
+    draws: Draws
 
 
 class Told(NamedTuple):
@@ -194,6 +196,16 @@ def _fly(blocks: Array, first: int, tables: Tables, task: Array, places: Array) 
                     w[MOVED + i * LANES + j] = w[PLANT + i * LANES + j]
         arrive(w)
     _tell_nearest(blocks, places)
+
+
+@inline_kernel
+def _foresee(blocks: Array, t: int, teams: Teams) -> None:
+    """Draw what the vehicles of team t meet after the present step."""
+    tables, n = teams.tables, teams.tables.neighbours.shape[0]
+    for i in range(n):
+        b, which = i // LANES, tables.which[DISTURBANCE : NOISE + 1, t * n + i]
+        step, block = int(blocks[b, STEP + i % LANES]), t * blocks.shape[0] + b
+        draw_ahead(teams.draws, t * n + i, block, step, tables.disturbances, tables.noises, which)
 
 
 @kernel
@@ -371,6 +383,7 @@ def step_teams(
             _command_team(blocks, first, n, actions, teams.history[t], task)
             _fly(blocks, first, tables, task, places)
             judge_team(blocks, first, aside, tables, task, team)
+        _foresee(blocks, t, teams)
         _inform(blocks, t, teams, rest, out)
         for i in range(n):
             _tell(blocks[i // LANES], i % LANES, first + i, told)
@@ -423,6 +436,7 @@ def begin_teams(
         for i in range(n):
             blocks[i // LANES, EPISODE_COST + i % LANES] = 0.0
             _promise(blocks[i // LANES], i % LANES, task[DT], teams.history[t, 0, i])
+        _foresee(blocks, t, teams)
         _inform(blocks, t, teams, rest, out)
         for i in range(n):
             _tell(blocks[i // LANES], i % LANES, first + i, told)

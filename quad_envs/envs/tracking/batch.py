@@ -15,10 +15,12 @@ from ...compilation.threads import Threads
 from ...disturbances import Disturbance
 from ...lanes import LANES, N_PLANT, N_TRACKING, Blocks
 from ...names import shown
+from ...normals import key_of
 from ...plant import N_STATE, POSITION, Array
 from ...references import Reference, make_reference, state_on
 from ...table_row import N_TABLE
 from ...tasks import Task
+from ..shared.draws import gusts_in_flight, make_draws
 from ..shared.given import given_plants
 from ..shared.packed_batch import PackedBatch
 from ..shared.tables import disturbance_rows, draw_vehicle, reference_rows, stage_times
@@ -44,18 +46,18 @@ class TrackingBatch(PackedBatch):
         self.options, self.n, self.task = options, n, options.task
         self._reference: Reference = make_reference(options.reference)
         self._disturbance: Disturbance | None = options.make_disturbance()
-        self._noise = np.repeat(np.asarray(self.task.sensor_noise), 3)
         # A table that is the same in every episode is stored once.
         random = (
             self._reference.random,
             self._disturbance is not None and self._disturbance.random,
-            bool(self._noise.any()),
+            max(self.task.sensor_noise) > 0.0,
         )
         count = [n if is_random else 1 for is_random in random]
         steps, dt, nodes = self.task.episode_steps, self.task.dt, 2 * options.substeps + 1
         references = (count[0], steps + 1 + self.task.layout.preview, N_TABLE)
-        disturbances = (count[1], steps if self._disturbance else 0, nodes, 6)
-        noises = (count[2], steps + 1 if random[2] else 0, N_STATE)
+        blown = 1 if gusts_in_flight(self._disturbance) else steps if self._disturbance else 0
+        disturbances = (count[1], blown, nodes, 6)
+        noises = (count[2], 1 if random[2] else 0, N_STATE)
         seen = (n, self.task.layout.size)
         require_memory(
             f"{shown(n)} flights of {steps} steps",
@@ -89,6 +91,7 @@ class TrackingBatch(PackedBatch):
             self.disturbances,
             self.noises,
             self.which,
+            make_draws(self._disturbance, self.task, options.substeps, n, self.vehicles.count),
             task_vector(self.task, options.substeps, options.lost_distance),
         )
         self._told_shape = N_TOLD + len(self.task.constraint_names), n
@@ -111,8 +114,8 @@ class TrackingBatch(PackedBatch):
     ) -> None:
         """Begin new episodes, and write their first observations and scores.
 
-        Draws for each flight, in this order: start (12 uniform numbers), vehicle, reference, disturbance,
-        sensor noise.
+        Draws for each flight, in this order: start (12 uniform numbers), vehicle, reference, disturbance, and
+        the key of gusts and sensor noise (one uniform number).
 
         Args:
             index: Flights, (m,).
@@ -151,11 +154,11 @@ class TrackingBatch(PackedBatch):
             self._place(*draw_vehicle(self.task, self._randomization, rng), i)
         if self._random[0]:
             self.references[i] = reference_rows(self._reference, self._times, rng)
-        if self._disturbance is not None and self._random[1]:
+        draws = self._arrays.draws
+        if self._disturbance is not None and self._random[1] and not draws.gusty:
             self.disturbances[i] = disturbance_rows(self._disturbance, self._nodes, self.task.dt, rng)
-        if self._random[2]:
-            rng.standard_normal(out=self.noises[i])
-            self.noises[i] *= self._noise
+        if draws.gusty or draws.noisy:
+            draws.keys[i] = key_of(rng.random())
 
     def tell(self, index: IntArray, out: NDArray[np.float32], told: Array) -> None:
         """Write observations and scores of flights as they are; arguments as in `begin`."""

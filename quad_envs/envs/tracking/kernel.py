@@ -52,6 +52,7 @@ from ...plant import N_INPUT, N_STATE, Array
 from ...reward import stage_cost_parts
 from ...table_row import N_TABLE
 from ...tasks import CRASH_CAUSES
+from ..shared.draws import Draws, draw_ahead
 from ..shared.task_vector import (
     ACTION_MAX,
     DT,
@@ -92,6 +93,7 @@ class Flights(NamedTuple):
     disturbances: Annotated[Array, "M, T, L, 6"]  # tables, L = 2 substeps + 1; no steps for none
     noises: Annotated[Array, "M, T, 12"]  # tables; no steps for none
     which: Annotated[IntArray, "3, n"]  # reference, disturbance and noise table of each vehicle
+    draws: Draws
     task: Annotated[Array, "S"]  # task vector
 
 
@@ -247,7 +249,8 @@ def encode_vehicle(
         out[start], out[start + 1], out[start + 2] = x[0], x[1], x[2]
         start += 3
     if task[SEES_DISTURBANCE] > 0.0:
-        encode_disturbance(out, start, int(w[STEP + j]), disturbance)
+        step = int(w[STEP + j])
+        encode_disturbance(out, start, step if step < int(task[EPISODE_STEPS]) else -1, disturbance)
         start += 6
     return start
 
@@ -300,6 +303,13 @@ def tell(w: Array, j: Int, i: int, flights: Flights, out: NDArray[np.float32], t
         flights.task,
         out[i],
     )
+
+
+@inline_kernel
+def foresee(w: Array, j: Int, i: int, flights: Flights) -> None:
+    """Draw what vehicle i, which is in lane j, meets after the present step."""
+    tables = flights.disturbances, flights.noises
+    draw_ahead(flights.draws, i, i // LANES, int(w[STEP + j]), *tables, flights.which[1:, i])
 
 
 @inline_kernel
@@ -400,6 +410,7 @@ def step_flights(
         judge(w, task)
         for j in range(lanes):
             ended += int(w[CRASHED + j] + w[TRUNCATED + j])
+            foresee(w, j, first + j, flights)
             tell(w, j, first + j, flights, out, told)
     return ended
 
@@ -456,6 +467,7 @@ def begin_flights(
         for j in range(lanes):
             i = index[first + j]
             w[REWARD + j], w[EPISODE_COST + j] = 0.0, 0.0
+            foresee(w, j, i, flights)
             tell(w, j, i, flights, out, told)
             move_lane(w, j, blocks[i // LANES], i % LANES)
     return -1
