@@ -73,6 +73,8 @@ def run_units(
             result = work(unit) if len(units) == 1 else _tried(work, unit)
             yield unit.number, result  # type: ignore[attr-defined]
         return
+    if not units:  # a cluster need not be joined
+        return
     with ENGINES[engine].start(jobs) as submit:
         yield from _run_elsewhere(partial(submit, *_packed(work)), units, jobs or len(units))
 
