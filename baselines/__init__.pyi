@@ -17,6 +17,7 @@ from .policies.disturbance_wrappers import DisturbanceEstimateWrapper as Disturb
 from .policies.disturbance_wrappers import (
     VectorDisturbanceEstimateWrapper as VectorDisturbanceEstimateWrapper,
 )
+from .policies.estimate_vector import EstimateVectorWrapper as EstimateVectorWrapper
 from .policies.estimate_wrapper import EstimateWrapper as EstimateWrapper
 from .policies.export import export_policy as export_policy
 from .policies.protocol import Policy as Policy

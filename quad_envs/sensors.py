@@ -41,6 +41,7 @@ SENSORS = {
     "range-azimuth-elevation": slice(RANGE, N_MEASUREMENT),
     "azimuth-elevation": slice(AZIMUTH, N_MEASUREMENT),
 }
+DEFAULT_SENSOR = "range-azimuth-elevation"
 MIN_HORIZONTAL_SQUARED = 1e-6  # m^2, smallest s^2 in a division
 OVERHEAD = 8.0  # the angles count where s > OVERHEAD sigma_el rho, the direction elsewhere
 

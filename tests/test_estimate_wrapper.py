@@ -79,7 +79,7 @@ def test_a_slot_tells_the_senders_estimate_of_before_fusion(delay):
     believed, places = [], []
     for k in range(6):
         places.append(env.plants[:, :3])
-        x, _ = env._sent[k]
+        x, _ = env._shared.sent(k)
         believed.append(x + np.pad(places[k], ((0, 0), (0, 3))))
         block = env.task.layout.decode(rows_of(seen)).estimate
         for i in range(6):
@@ -100,7 +100,7 @@ def test_the_own_estimate_is_the_intersection_of_all(fusion):
     env.reset(seed=0)
     for _ in range(5):
         seen, *_ = env.step(hover(env))
-    x, P = env._sent[-1]
+    x, P = env._shared.sent(5)
     p = env.plants[:, :3]
     block = env.task.layout.decode(rows_of(seen)).estimate
     for i in range(6):

@@ -78,7 +78,7 @@ def test_labels_grow_and_are_all_drawn_from():
 @pytest.mark.parametrize(
     ("name", "env_id", "message"),
     [
-        ("", "quad/TargetTracking-v0", "no expert for target-tracking tasks: what cooperative-mpc knows"),
+        ("", "quad/CooperativeEstimation-v0", "no expert for estimation tasks, whose actions are estimates"),
         ("central-mpc", FORMATION, "decides from the whole truth"),
         ("nmcp", HELIX, "did you mean 'nmpc'"),
         ("lmpc", FORMATION, "for tracking tasks, not for formation"),

@@ -1,52 +1,32 @@
-"""Sharing estimates: a wrapper that runs a target filter per agent and lets neighbours exchange them.
+"""Sharing estimates: wrappers that run a target filter per agent and let neighbours exchange them.
 
-Each agent filters what its own observation holds. Its estimate and covariance travel with its messages, and
-in the step in which a message arrives the receiver intersects the covariances: all agents fuse at once, from
-estimates of before any fusion, moved on by the message's age. The block `estimate` at the end of the
-observation then has the own estimate and, of each comm slot, what came with the message.
+What is exchanged and how it is fused, `shared_filters` says. The block `estimate` at the end of the
+observation has the own estimate and, of each comm slot, what came with the message.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo.utils import BaseParallelWrapper
 
-from controllers.estimation import covariance_intersection
 from controllers.estimation.consistency import nees
-from controllers.estimation.ekf import constant_velocity_model
-from quad_envs.names import unknown_name
-from quad_envs.observations.team import (
-    COMM_AGE,
-    COMM_POSITION,
-    COMM_WEIGHT,
-    N_ESTIMATE,
-)
 from quad_envs.parameters import Array
 from quad_envs.tasks import TeamTask
 
-from .estimation import make_estimator
 from .estimation_kernels import P, X
 from .protocol import Actions
+from .shared_filters import Fusion as Fusion
+from .shared_filters import SharedFilters
 
-Fusion = Literal["trace", "equal", "determinant", "none"]
-_VECH = np.triu_indices(3)  # xx, xy, xz, yy, yz, zz
 _BOUND = 1e6
 
 _Dict = dict[str, Any]
-
-
-class _Heard(NamedTuple):
-    """Estimates that came with the messages of this step, relative to their receivers."""
-
-    x: Array  # (m, K, 6)
-    P: Array  # (m, K, 6, 6)
-    valid: NDArray[np.bool_]  # (m, K)
 
 
 class EstimateWrapper(BaseParallelWrapper):  # type: ignore[misc]
@@ -77,29 +57,21 @@ class EstimateWrapper(BaseParallelWrapper):  # type: ignore[misc]
                 f"EstimateWrapper needs a ParallelEnv of this suite without estimates, got {env!r}; take "
                 "quad_envs.target_tracking_v0 or cooperative_estimation_v0"
             )
-        if fusion not in get_args(Fusion):
-            raise ValueError(unknown_name("fusion", fusion, get_args(Fusion)))
-        self._inner, self.fusion = inner, fusion
-        self.estimator = make_estimator(inner, estimator, q)
-        if fusion != "none" and not self.estimator.can_fuse:
-            raise ValueError(
-                f"{estimator!r} cannot take fused estimates over: give it `replaced(memory, x, P)`, or "
-                "choose fusion='none'"
-            )
+        self._inner, self.fusion, options = inner, fusion, env.unwrapped.options
+        self._shared = SharedFilters(
+            inner, env.unwrapped.senders, options.message_lifetime, 1, fusion, q, estimator
+        )
+        self.estimator = self._shared.estimator
         self.task = replace(inner, layout=replace(inner.layout, estimate=True))
         size = self.task.layout.size
         self.observation_spaces = {
             name: spaces.Box(-_BOUND, _BOUND, (size,), np.float32) for name in env.possible_agents
         }
-        self._senders: NDArray[np.int64] = env.unwrapped.senders
         self._begin()
 
     def _begin(self) -> None:
-        n, K = self._senders.shape
         self._step = 0
-        self._filters: Array = np.zeros((n, self.estimator.size))
-        self._told = np.full((n, K), -1, dtype=np.int64)  # step at which the last message of a slot was sent
-        self._sent: list[tuple[Array, Array]] = []  # estimates of all agents before fusion, step by step
+        self._shared.begin(np.arange(self._inner.vehicles))
 
     def __getstate__(self) -> _Dict:
         """Everything: attributes that begin with an underscore are those of this wrapper."""
@@ -133,78 +105,17 @@ class EstimateWrapper(BaseParallelWrapper):  # type: ignore[misc]
             return {}
         agents = np.array([self.env.possible_agents.index(name) for name in names])
         rows = np.stack([observations[name] for name in names])
-        start = np.full(len(names), self._step == 0)
-        done = self.estimator.step(rows, self._filters[agents], start)
-        heard = self._exchange(agents, done.filters, done.parts.comm)
-        filters = self._fused(done.filters, heard)
-        self._filters[agents] = filters
-        block = self._block(filters, heard)
-        consistency = self._consistency(agents, filters)
+        known = self._shared.step(agents, rows)
+        consistency = self._consistency(agents, known.filters)
         for i, name in enumerate(names):
             infos[name]["nees"] = float(consistency[i])
-            infos[name]["nis"] = float(done.reports[i, 0])
-            infos[name]["nis_rows"] = int(done.reports[i, 1])
-            infos[name]["mode"] = f"EKF,{int(done.reports[i, 2])}"
-        return {name: np.concatenate([row, more]) for name, row, more in zip(names, rows, block, strict=True)}
-
-    def _exchange(self, agents: NDArray[np.int64], filters: Array, comm: Array) -> _Heard:
-        """What the messages that arrive in this step bring."""
-        n, K, layout = len(agents), self._senders.shape[1], self._inner.layout
-        everybody = np.zeros_like(self._filters)
-        everybody[agents] = filters
-        self._sent.append((everybody[:, X].copy(), everybody[:, P].reshape(-1, 6, 6).copy()))
-        heard = _Heard(np.zeros((n, K, 6)), np.zeros((n, K, 6, 6)), np.zeros((n, K), dtype=np.bool_))
-        if self.fusion == "none":
-            return heard
-        slots = comm.reshape(n, K, layout.comm_size)
-        ages = np.rint(slots[..., COMM_AGE] / self.task.dt).astype(np.int64)
-        sent = self._step - ages
-        heard.valid[:] = (slots[..., COMM_WEIGHT] > 0.0) & (sent > self._told[agents])
-        for step in np.unique(sent[heard.valid]).tolist():
-            which = heard.valid & (sent == step)
-            sender = self._senders[agents][which]
-            everywhere, spreads = self._sent[step]
-            x, covariance = self._moved_on(everywhere[sender], spreads[sender], self._step - step)
-            x[:, :3] += slots[which][:, COMM_POSITION]
-            heard.x[which], heard.P[which] = x, covariance
-        told = self._told[agents]
-        told[heard.valid] = sent[heard.valid]
-        self._told[agents] = told
-        return heard
-
-    def _moved_on(self, x: Array, covariance: Array, steps: int) -> tuple[Array, Array]:
-        """Estimates (m, 6) some steps later, from an origin that stays."""
-        if steps == 0:
-            return x, covariance
-        F, Q = constant_velocity_model(steps * self.task.dt, self.estimator.q)
-        return x @ F.T, F @ covariance @ F.T + Q
-
-    def _fused(self, filters: Array, heard: _Heard) -> Array:
-        """The filters after covariance intersection, (m, size)."""
-        if not heard.valid.any():
-            return filters
-        n = len(filters)
-        own = np.ones((n, 1), dtype=np.bool_)
-        fused = covariance_intersection(
-            np.concatenate([filters[:, None, X], heard.x], axis=1),
-            np.concatenate([filters[:, P].reshape(n, 1, 6, 6), heard.P], axis=1),
-            np.concatenate([own, heard.valid], axis=1),
-            self.fusion,
-        )
-        out = filters.copy()
-        out[:, X], out[:, P] = fused.x, fused.P.reshape(n, 36)
-        return self.estimator.take_over(out)
-
-    def _block(self, filters: Array, heard: _Heard) -> Actions:
-        """The estimate block of the observation, (m, (1 + K) 13)."""
-        n = len(filters)
-        x = np.concatenate([filters[:, None, X], heard.x], axis=1)
-        covariance = np.concatenate([filters[:, P].reshape(n, 1, 6, 6), heard.P], axis=1)
-        out = np.zeros((*x.shape[:2], N_ESTIMATE), dtype=np.float32)
-        out[..., 0] = np.concatenate([np.ones((n, 1)), heard.valid], axis=1)
-        out[..., 1:7] = x
-        out[..., 7:] = covariance[..., :3, :3][..., _VECH[0], _VECH[1]]
-        return out.reshape(n, -1)
+            infos[name]["nis"] = float(known.reports[i, 0])
+            infos[name]["nis_rows"] = int(known.reports[i, 1])
+            infos[name]["mode"] = f"EKF,{int(known.reports[i, 2])}"
+        return {
+            name: np.concatenate([row, more])
+            for name, row, more in zip(names, rows, known.block, strict=True)
+        }
 
     def _consistency(self, agents: NDArray[np.int64], filters: Array) -> Array:
         """Normalised error squared of the positions, from the truth."""

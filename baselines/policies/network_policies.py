@@ -1,4 +1,4 @@
-"""A network as the policy that it was trained to be: with an estimate of the disturbance, if it sees one."""
+"""A network as the policy that it was trained to be: with an estimate of the disturbance or of a target."""
 
 from __future__ import annotations
 
@@ -6,32 +6,40 @@ from typing import Any
 
 from numpy.typing import ArrayLike, NDArray
 
-from quad_envs.tasks import BaseTask
+from quad_envs.tasks import BaseTask, TeamTask
 
 from .disturbance_estimate import DisturbanceEstimator, sees_estimate
 from .network import Network, NetworkPolicy
 from .protocol import Actions, PolicyState
 from .rows import as_rows, as_starts, require_finite, state_of
+from .target_estimate import TargetBelief, sees_target_estimate
 
 
 class EstimatingPolicy:
-    """A network that sees an estimate of the disturbance; what the estimator remembers travels in the state.
+    """A network that sees an estimate; what the estimator remembers travels in the state.
 
     Args:
-        network: Whose features have the estimate.
+        network: Whose features have an estimate, of the disturbance or of the target.
         task: Where it flies, without the estimate.
         name: For tables.
         kind: What it knows: "model-free", "imitation" or "model-based".
 
     Raises:
-        ValueError: If the task is one of a team, or does not fit the network.
+        ValueError: If there is nothing of the kind to estimate in the task, or it does not fit the network.
     """
 
     # Of the task: what it sees, the scale of its outputs, and what the estimator takes for nominal.
-    decides_from = ("layout", "limits.kappa", "params", "dt", "sensor_noise")
+    decides_from = (
+        *("layout", "limits.kappa", "params", "dt", "sensor_noise"),
+        *("sensor", "sensor_sigma", "prior_velocity", "prior_sigma"),
+    )
 
     def __init__(self, network: Network, task: BaseTask, name: str, kind: str = "") -> None:
-        self._estimator = DisturbanceEstimator(task)
+        self._estimator: DisturbanceEstimator | TargetBelief
+        if isinstance(task, TeamTask) and sees_target_estimate(network.features, task):
+            self._estimator = TargetBelief(task)
+        else:
+            self._estimator = DisturbanceEstimator(task)
         self._network = NetworkPolicy(network, self._estimator.task, name, kind)
         self.network, self.task, self.name, self.kind = network, self._estimator.given, name, kind
 
@@ -54,7 +62,11 @@ class EstimatingPolicy:
         require_finite(obs, self.task.layout.slices)
         start = as_starts(episode_start, len(obs))
         kept = state_of(state, len(obs), self._estimator.memory_size)
-        seen, memory = self._estimator.extend(obs, kept.memory, start)
+        if isinstance(self._estimator, TargetBelief):
+            seen, memory, estimates = self._estimator.believe(obs, kept.memory, start)
+            kept = kept._replace(estimates=estimates)
+        else:
+            seen, memory = self._estimator.extend(obs, kept.memory, start)
         actions, _ = self._network.predict(seen)
         return actions[0] if one else actions, kept._replace(memory=memory)
 
@@ -67,5 +79,6 @@ def network_policy(
     Raises:
         ValueError: If the task does not fit it.
     """
-    made = EstimatingPolicy if sees_estimate(network.features) else NetworkPolicy
+    estimates = sees_estimate(network.features) or sees_target_estimate(network.features, task)
+    made = EstimatingPolicy if estimates else NetworkPolicy
     return made(network, task, name, kind)

@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import os
 import shlex
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quad_envs.names import shown, unknown_name
+from quad_envs.sensors import DEFAULT_SENSOR
+from quad_envs.tasks import TeamTask
 
 from ..errors import CheckpointError
 
@@ -107,11 +110,29 @@ def load_policy(source: str | os.PathLike[str], env: Any) -> NetworkPolicy | Est
             f"{where} was trained on {shown(said.get('env_id'))}, a task of the kind {shown(mission)}; "
             f"{task.env_id} is one of {task.mission}: train one for it with quad-envs train {task.env_id}"
         )
+    if isinstance(task, TeamTask) and task.layout.target:
+        _require_sensor(where, said, task)
     name = os.fspath(source) if folder.parent == SHIPPED else folder.name or str(folder)
     try:
         return network_policy(network, task, name, str(said.get("kind", "")))
     except ValueError as error:
         raise CheckpointError(f"{where} does not fit {task.env_id}: {error}") from error
+
+
+def _require_sensor(where: str, said: Mapping[str, Any], task: TeamTask) -> None:
+    """Check that a network flies with the sensor with which it was trained.
+
+    Raises:
+        CheckpointError: If it was another one.
+    """
+    given = said.get("env_kwargs", {})
+    trained = given.get("sensor", DEFAULT_SENSOR) if isinstance(given, Mapping) else task.sensor
+    if trained != task.sensor:
+        raise CheckpointError(
+            f"{where} was trained with the sensor {shown(trained)}, and {task.env_id} has {task.sensor!r} "
+            f"here: pass sensor={trained!r}, or train one with quad-envs train {task.env_id} --set "
+            f"sensor={task.sensor}"
+        )
 
 
 def checkpoint_folder(source: str | os.PathLike[str]) -> Path:

@@ -52,7 +52,7 @@ ALGORITHMS: dict[str, Algorithm] = {
         "train",
         PolicyGradientOptions,
         "model-based",
-        (TRACKING, FORMATION),
+        (TRACKING, FORMATION, TARGET),
         "analytic policy gradient through the compiled dynamics",
     ),
     "dagger": Algorithm(
@@ -60,7 +60,7 @@ ALGORITHMS: dict[str, Algorithm] = {
         "train",
         DaggerOptions,
         "imitation",
-        (TRACKING, FORMATION),
+        (TRACKING, FORMATION, TARGET),
         "imitation of an MPC, labelled where the network flies",
         15.0,
     ),

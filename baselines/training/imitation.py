@@ -36,7 +36,7 @@ from .policy_gradient import Actor
 if TYPE_CHECKING:
     import torch
 
-_EXPERTS = {"tracking": "sdc-nmpc", "formation": "consensus-mpc"}
+_EXPERTS = {"tracking": "sdc-nmpc", "formation": "consensus-mpc", "target-tracking": "cooperative-mpc"}
 _STREAM = 0xDA_66E2  # apart from the seeds of environments, so that no start is one of those held out
 
 
@@ -154,8 +154,8 @@ def make_expert(
     mission = task.mission
     if not name and mission not in _EXPERTS:
         raise ValueError(
-            f"dagger has no expert for {mission} tasks: what cooperative-mpc knows of the target is in its "
-            "filter, not in an observation; ppo trains there"
+            f"dagger has no expert for {mission} tasks, whose actions are estimates: take "
+            "quad/TargetTracking-v0"
         )
     if separation is not None:
         if not isinstance(task, TeamTask) or not separation >= task.separation:

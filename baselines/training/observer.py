@@ -9,10 +9,11 @@ from quad_envs.encoding import Encoder, Encoding
 from quad_envs.tasks import Task, TeamTask
 
 from ..policies.disturbance_estimate import Bools, DisturbanceEstimator, Floats, sees_estimate
+from ..policies.target_estimate import TargetBelief, sees_target_estimate
 
 
 class Observer:
-    """Observations to features, row by row; with the disturbance's estimate, where the network sees one.
+    """Observations to features, row by row; with an estimate of disturbance or target, if it is seen.
 
     Args:
         encoding: What the network sees and commands.
@@ -24,7 +25,11 @@ class Observer:
     """
 
     def __init__(self, encoding: Encoding, task: Task | TeamTask, n: int) -> None:
-        self._estimator = DisturbanceEstimator(task) if sees_estimate(encoding.features) else None
+        self._estimator: DisturbanceEstimator | TargetBelief | None = None
+        if isinstance(task, TeamTask) and sees_target_estimate(encoding.features, task):
+            self._estimator = TargetBelief(task)
+        elif sees_estimate(encoding.features):
+            self._estimator = DisturbanceEstimator(task)
         self.encoder = Encoder(encoding, task if self._estimator is None else self._estimator.task)
         self._memory = np.zeros((n, 0 if self._estimator is None else self._estimator.memory_size))
 

@@ -8,13 +8,14 @@ new beginning.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_envs.encoding import Encoder, Encoding
+from quad_envs.encoding import Encoding
 from quad_envs.envs.team.adjoint import TeamRecord, advance_teams_vjp, observe_teams_vjp, team_scratch
 from quad_envs.envs.team.batch import TeamBatch
 from quad_envs.envs.team.exchange import N_MOTION
@@ -27,8 +28,9 @@ from quad_envs.parameters import N_COEFFICIENTS
 from quad_envs.plant import N_INPUT, Array
 from quad_envs.table_row import N_TABLE
 
-from .features import training_features
+from .features import require_measured, training_features
 from .flights import Bools, Floats
+from .observer import Observer
 
 
 class TeamStep(NamedTuple):
@@ -72,8 +74,9 @@ class DifferentiableTeams:
         self.batch = TeamBatch(options, self.teams)
         self.task = self.batch.task
         self._kept = options.separation if separation is None else float(separation)
-        self._encoder = Encoder(Encoding(training_features(options, stages)), self.task)
-        self._columns = self.features.columns(self.task.layout)
+        self._observer = Observer(Encoding(training_features(options, stages)), self.task, self.n)
+        seen = self._observer.encoder.task.layout
+        self._columns, self._width = self.features.columns(seen), seen.size
         self._scale = np.asarray(self.features.scale)
         self._scratch = team_scratch(self._size, options.substeps, self.task.layout.sensed)
         self._out = np.empty((self.n, self.task.layout.size), dtype=np.float32)
@@ -81,12 +84,13 @@ class DifferentiableTeams:
         self._cut = self.rng.integers(1, self.task.episode_steps + 1, self.teams)
         self._told = self.batch.fresh_scores()
         self._begin(np.arange(self.teams))
+        self._seen = self._observer.see(self._out, np.ones(self.n, dtype=np.bool_))
         self.begin_window(0)
 
     @property
     def features(self) -> Features:
         """What the network sees."""
-        return self._encoder.encoding.features
+        return self._observer.encoder.encoding.features
 
     def _begin(self, index: NDArray[np.int64]) -> None:
         self.batch.begin(index, [self.rng] * len(index), self._out.reshape(-1), self._told)
@@ -97,20 +101,23 @@ class DifferentiableTeams:
 
     def observe(self) -> Floats:
         """Scaled features of all vehicles as they are, (n, features)."""
-        return self._encoder.see(self._out)
+        return self._seen
 
     def observe_vjp(self, step: TeamStep, bar: Floats) -> tuple[Array, Array]:
         """Sensitivities to the plants (n, 16) and the last commands (n, 4) from those to `observe`.
 
-        Those to motions that were sent earlier wait for their step: go back step by step.
+        Those to motions that were sent earlier wait for their step: go back step by step. What a filter
+        believes of a target is given; where it is relative to the vehicle is not.
         """
-        full = np.zeros((self.n, self.task.layout.size))
+        full, shown = np.zeros((self.n, self._width)), self.task.layout.size
         full[:, self._columns] = bar / self._scale
         plants, commands, arrays = np.empty((self.n, N_PLANT)), np.empty((self.n, N_INPUT)), self.batch.arrays
         observe_teams_vjp(
             step.record, step.t, arrays.tables, arrays.task, arrays.team, full, self._owed, plants, commands,
             self._scratch,
         )  # fmt: skip
+        if self._width > shown:
+            plants[:, :3] -= full[:, shown + 1 : shown + 4]
         return plants, commands
 
     def advance(self, actions: Floats) -> TeamStep:
@@ -139,11 +146,14 @@ class DifferentiableTeams:
             force_max=vehicles.read(FORCE_MAX, N_INPUT),
             coefficients=vehicles.read(COEFFICIENTS, N_COEFFICIENTS),
         )
+        self._seen = self._observer.see(self._out)
         self._cut -= 1
         ended = (scores.terminated | scores.truncated).reshape(self.teams, -1).all(axis=1) | (self._cut == 0)
         if ended.any():
             self._cut[ended] = self.task.episode_steps
             self._begin(np.flatnonzero(ended))
+            rows = np.flatnonzero(np.repeat(ended, self._size))
+            self._seen[rows] = self._observer.see(self._out[rows], np.ones(len(rows), dtype=np.bool_), rows)
         self._t += 1
         done = np.repeat(ended, self._size)
         return TeamStep(record, self._t - 1, slopes, scores.reward, scores.crashed, done)
@@ -183,6 +193,7 @@ def require_differentiable(options: TeamOptions, separation: float | None = None
     Raises:
         ValueError: If not; the message names what is in its way, and the remedy.
     """
+    require_measured(options)
     if separation is not None and not separation >= options.separation:
         raise ValueError(
             f"hyperparameter separation must be at least the task's own, {options.separation:g} m, got "
@@ -194,7 +205,9 @@ def require_differentiable(options: TeamOptions, separation: float | None = None
         raise ValueError(
             "the analytic policy gradient does not pass through plans that vehicles send: choose comm='state'"
         )
-    again = replace(options).graphs
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # they were given
+        again = replace(options).graphs
     if not all(map(np.array_equal, again, options.graphs)):
         raise ValueError(
             f"graph {shown(options.graph)} is drawn at random: it gives other neighbours each time that it "

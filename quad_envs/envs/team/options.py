@@ -36,7 +36,7 @@ from ...observations.team import N_COMM, N_SENSED, AgentLayout
 from ...observations.tracking import N_REFERENCE
 from ...parameters import Array, QuadrotorParams
 from ...references import ReferenceLike
-from ...sensors import sensor_rows
+from ...sensors import DEFAULT_SENSOR, sensor_rows
 from ...targets import TargetLike, make_target
 from ...tasks import TeamTask
 from ..shared.given import as_numbers
@@ -296,7 +296,7 @@ class TargetTrackingOptions(TeamOptions):
     graph: str | GraphLike | GraphSchedule = "ring"
     target: TargetLike = "cv"  # afterwards what moves
     target_spread: tuple[float, float] = (0.0, 0.0)
-    sensor: str = "range-azimuth-elevation"
+    sensor: str = DEFAULT_SENSOR
     sensor_sigma: Triple = (0.1, 0.02, 0.02)
     detection: float = 1.0
     measuring: str | tuple[int, ...] = "all"

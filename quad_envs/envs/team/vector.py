@@ -75,6 +75,16 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
         return self._batch.task
 
     @property
+    def options(self) -> TeamOptions:
+        """The arguments of the environment as a value."""
+        return self._batch.options
+
+    @property
+    def senders(self) -> NDArray[np.int64]:
+        """Vehicle of the team behind each comm slot, -1 for none, (N, K)."""
+        return self._batch.neighbours.copy()
+
+    @property
     def plants(self) -> Array:
         """Copy of the plants [p, V_B, Theta, Omega, F], (n N, 16). For study and tests."""
         return self._batch.vehicles.read(PLANT, N_PLANT)
