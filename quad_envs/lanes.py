@@ -142,9 +142,9 @@ class Blocks:
     """
 
     def __init__(self, n: int, size: int, group: int | None = None) -> None:
-        self.n, self._group = n, group or n
-        self.each = -(-self._group // LANES)  # blocks of a group
-        self.array: Array = np.zeros((n // self._group * self.each + 1, size))
+        self.n, self.group = n, group or n
+        self.each = -(-self.group // LANES)  # blocks of a group
+        self.array: Array = np.zeros((n // self.group * self.each + 1, size))
 
     @property
     def count(self) -> int:
@@ -154,7 +154,7 @@ class Blocks:
     def read(self, row: int, count: int = 1) -> Array:
         """Copy of one quantity of all vehicles, (n,), or of `count` that follow each other, (n, count)."""
         lanes = self._rows()[:-1, row // LANES : row // LANES + count].transpose(0, 2, 1)
-        groups = np.ascontiguousarray(lanes).reshape(-1, self.each * LANES, count)[:, : self._group]
+        groups = np.ascontiguousarray(lanes).reshape(-1, self.each * LANES, count)[:, : self.group]
         found = groups.reshape(self.n, count)
         return found[:, 0] if count == 1 else found
 
@@ -164,7 +164,7 @@ class Blocks:
         if i is None:
             self._rows()[:, rows] = values[:, None]
         else:
-            group, place = divmod(i, self._group)
+            group, place = divmod(i, self.group)
             self._rows()[group * self.each + place // LANES, rows, place % LANES] = values
 
     def _rows(self) -> Array:

@@ -126,8 +126,8 @@ class QuadrotorParams:
     @property
     def arm_lengths(self) -> tuple[float, float]:
         """L cos(delta) and L sin(delta): the place of rotor 1, m."""
-        delta = FRAMES[self.frame]
-        return self.arm * math.cos(delta), self.arm * math.sin(delta)
+        along, across = self.arm_shares()
+        return self.arm * along, self.arm * across
 
     def rotor_positions(self) -> Array:
         """Rotors 1 to 4 in body axes (forward, right), (4, 2), m."""
@@ -148,30 +148,42 @@ class QuadrotorParams:
         B[RATES] = M[1:] / np.array(self.inertia)[:, None]
         return B
 
-    def coefficients(self) -> Array:
-        """What the equations of motion use of the parameters, in kernel order, (N_COEFFICIENTS,)."""
-        Jx, Jy, Jz = self.inertia
-        along, across = self.arm_lengths
-        return np.array(
-            [
-                self.gravity,
-                1.0 / self.mass,
-                self.drag / self.mass,
-                (Jy - Jz) / Jx,
-                (Jz - Jx) / Jy,
-                (Jx - Jy) / Jz,
-                along / Jx,
-                along / Jy,
-                self.yaw_moment / Jz,
-                1.0 / Jx,
-                1.0 / Jy,
-                1.0 / Jz,
-                across / Jx,
-                across / Jy,
-                self.rotor_rate,
-                self.hover_force,
-            ]
+    def coefficients(self, **varied: Array) -> Array:
+        """What the equations of motion use of the parameters, in kernel order, (..., N_COEFFICIENTS).
+
+        Args:
+            varied: Of many vehicles: parameters that are not those of this one, (...), the inertia (..., 3).
+        """
+        mass, arm, yaw_moment, rotor_rate, drag = (
+            varied.get(name, getattr(self, name))
+            for name in ("mass", "arm", "yaw_moment", "rotor_rate", "drag")
         )
+        Jx, Jy, Jz = np.moveaxis(np.asarray(varied.get("inertia", self.inertia)), -1, 0)
+        along, across = (arm * share for share in self.arm_shares())
+        parts = (
+            self.gravity,
+            1.0 / mass,
+            drag / mass,
+            (Jy - Jz) / Jx,
+            (Jz - Jx) / Jy,
+            (Jx - Jy) / Jz,
+            along / Jx,
+            along / Jy,
+            yaw_moment / Jz,
+            1.0 / Jx,
+            1.0 / Jy,
+            1.0 / Jz,
+            across / Jx,
+            across / Jy,
+            rotor_rate,
+            mass * self.gravity / 4.0,
+        )
+        return np.stack(np.broadcast_arrays(*parts), axis=-1)
+
+    def arm_shares(self) -> tuple[float, float]:
+        """Place of rotor 1, forward and right, in arm lengths."""
+        delta = FRAMES[self.frame]
+        return math.cos(delta), math.sin(delta)
 
 
 @dataclass(frozen=True, slots=True)

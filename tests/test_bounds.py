@@ -17,7 +17,7 @@ from baselines.training.request import TrainingRequest
 from quad_envs import checks, cooperative_estimation_v0, formation_v0, target_tracking_v0
 from quad_envs.checks import Bound, require_memory, require_number, require_whole
 from quad_envs.disturbances import Gusts, Steady
-from quad_envs.envs.shared.tables import draw_vehicle
+from quad_envs.envs.shared.random_vehicles import drawn_vehicles
 from quad_envs.envs.shared.vehicle_options import RANDOMIZABLE
 from quad_envs.envs.team.options import EstimationOptions, FormationOptions
 from quad_envs.envs.tracking.options import TrackingOptions
@@ -228,7 +228,7 @@ def test_drawn_inertias_are_those_of_bodies(spread):
     options = TrackingOptions(randomize={"inertia": spread, "mass": 0.1})
     rng, capped = np.random.default_rng(0), 0
     for _ in range(300):
-        coefficients, _ = draw_vehicle(options.task, options.randomization(), rng)
+        (coefficients,), _ = drawn_vehicles(options.task, options.randomization(), rng.random((1, 4)))
         J = 1.0 / coefficients[9:12]
         assert J.max() <= (J.sum() - J.max()) * (1.0 + 1e-12)  # rounding of the inverse
         capped += J.max() > (J.sum() - J.max()) * (1.0 - 1e-12)

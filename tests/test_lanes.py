@@ -28,11 +28,13 @@ from quad_envs.dynamics import (
     disturbed_substep,
     rotor_limits,
 )
+from quad_envs.envs.shared.random_vehicles import drawn_vehicles, random_vehicles
 from quad_envs.envs.shared.task_vector import task_vector
 from quad_envs.envs.shared.vehicle_options import CRASH_TILT
 from quad_envs.envs.tracking.kernel import command, judge
-from quad_envs.lanes import LANES, N_FLIGHT, N_TRACKING, Blocks
+from quad_envs.lanes import COEFFICIENTS, DECAY, FORCE_MAX, LANES, N_FLIGHT, N_TRACKING, Blocks
 from quad_envs.normals import draw
+from quad_envs.parameters import N_COEFFICIENTS, ROTOR_RATE
 from quad_envs.references import Heading, Racetrack, RandomSmooth
 from quad_envs.reward import stage_cost
 from quad_envs.table_row import N_TABLE
@@ -268,18 +270,55 @@ def test_four_places_take_the_squared_distance_of_the_nearest_point():
     assert np.array_equal(block[:12], places[:3].ravel())
 
 
-def test_a_random_reference_is_the_sum_of_its_sines():
-    reference, times = RandomSmooth(harmonics=4), np.linspace(0.0, 12.0, 241)
+@pytest.mark.parametrize("group", [11, 3])
+@pytest.mark.parametrize("randomize", [0.2, {"inertia": 0.9, "kappa": 0.1}, {"drag": 0.3, "mass": 0.2}])
+def test_random_vehicles_in_lanes_are_those_of_the_readable_twin(group, randomize):
+    options = gym.make(HELIX, randomize=randomize, drag=0.1, kappa=(0.5, 0.6, 0.7, 0.8), frame="x").unwrapped
+    task, spreads = options.task, options.options.randomization()
+    vehicles, chosen = Blocks(4 * group, N_FLIGHT, group), np.array([0, 7, 2, 4 * group - 1])
+    drawn = random_vehicles(task, spreads)
+    uniform = np.random.default_rng(0).random((4, drawn.columns.size))
+    drawn.place(uniform, chosen, vehicles, 0.01)
+    coefficients, most = drawn_vehicles(task, spreads, uniform)
+    np.testing.assert_allclose(vehicles.read(COEFFICIENTS, N_COEFFICIENTS)[chosen], coefficients, rtol=1e-14)
+    np.testing.assert_allclose(vehicles.read(FORCE_MAX, 4)[chosen], most, rtol=1e-15)
+    decay = np.exp(-0.005 * coefficients[:, ROTOR_RATE])
+    np.testing.assert_allclose(vehicles.read(DECAY)[chosen], decay, rtol=1e-15)
+    others = np.setdiff1d(np.arange(4 * group), chosen)
+    assert not vehicles.read(COEFFICIENTS, N_COEFFICIENTS)[others].any()
+
+
+@pytest.mark.parametrize(
+    "times", [np.linspace(0.0, 12.0, 241), np.geomspace(0.1, 9.0, 50), np.arange(3.0), np.zeros(1)]
+)
+def test_a_random_reference_is_the_sum_of_its_sines(times):
+    reference = RandomSmooth(harmonics=4)
     rows = reference.rows(times, np.random.default_rng(5))
     draws = np.random.default_rng(5).random((3, 3, 4))
     amplitude = draws[0] / draws[0].sum(axis=1, keepdims=True) * np.array(reference.amplitude)[:, None]
     rate = reference.rate_min + (reference.rate_max - reference.rate_min) * draws[1]
     phase = 2.0 * np.pi * draws[2]
     angle = times[:, None, None] * rate + phase
-    np.testing.assert_allclose(
-        rows[:, :3], (amplitude * (np.sin(angle) - np.sin(phase))).sum(axis=2), atol=1e-14
-    )
-    np.testing.assert_allclose(rows[:, 3:6], (amplitude * rate * np.cos(angle)).sum(axis=2), atol=1e-14)
+    position = (amplitude * (np.sin(angle) - np.sin(phase))).sum(axis=2)
+    # where steps are equal angles are doubled, here six times, each with a rounding or two
+    np.testing.assert_allclose(rows[:, :3], position, atol=2e-14)
+    np.testing.assert_allclose(rows[:, 3:6], (amplitude * rate * np.cos(angle)).sum(axis=2), atol=2e-14)
+    assert (rows[:, 6:] == [0.0, 1.0]).all()
+
+
+def test_tables_of_flights_that_begin_are_those_of_their_reference():
+    env = gym.make_vec("quad/RandomTracking-v0", num_envs=LANES + 2, randomize=0.1)
+    observations, _ = env.reset(seed=3)
+    unwrapped, start = env.unwrapped, env.unwrapped.task.layout.preview_start
+    times = 0.05 * np.arange(unwrapped.reference.shape[1])
+    for i, reference in enumerate(unwrapped.reference):
+        rng = seeding.np_random(3 + i)[0]
+        rng.random(12 + 7)  # start, and mass, inertia, arm, kappa and rotor rate
+        expected = RandomSmooth().rows(times, rng)
+        np.testing.assert_array_equal(reference, expected)
+        expected[:, :3] -= unwrapped.state[i, :3]
+        window = expected[:26].astype(np.float32)
+        np.testing.assert_array_equal(observations[i, start:].reshape(26, 8), window)
 
 
 def test_a_table_of_references_is_that_of_the_readable_twin():

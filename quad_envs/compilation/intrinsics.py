@@ -17,13 +17,22 @@ from numpy.typing import NDArray
 
 from ..plant import Array
 
+_LINE = 64  # bytes of the cache
+
 
 def _write_stage(
-    out: NDArray[np.float32], start: int, table: Array, row: int, p: tuple[float, float, float]
+    out: NDArray[np.float32],
+    start: int,
+    previews: NDArray[np.float32],
+    row: int,
+    p: tuple[float, float, float],
 ) -> None:
-    """Eight numbers out[start:] = table[row, :8] - [p, 0, 0, 0, 0, 0], as float32; both are C-contiguous."""
-    out[start : start + 3] = table[row, :3] - np.array(p)
-    out[start + 3 : start + 8] = table[row, 3:8]
+    """Write a stage of a preview, eight numbers out[start:]: position - p, velocity, sine, cosine.
+
+    A row of previews, see `table_row`, has the position in doubles. Both arrays are C-contiguous.
+    """
+    out[start : start + 3] = previews[row, :6].view(np.float64) - np.array(p)
+    out[start + 3 : start + 8] = previews[row, 6:11]
 
 
 def _take_nearer(places: Array, at: int, x: float, y: float, z: float) -> None:
@@ -34,6 +43,10 @@ def _take_nearer(places: Array, at: int, x: float, y: float, z: float) -> None:
     four = places[at : at + 16].reshape(4, 4)
     square = (four[0] - x) ** 2 + (four[1] - y) ** 2 + (four[2] - z) ** 2
     four[3] = np.minimum(square, four[3])
+
+
+def _fetch(table: Array | NDArray[np.float32], row: int, rows: int) -> None:
+    """Ask for rows row..row+rows-1 of a C-contiguous table, that they be in the cache when they are read."""
 
 
 def _borrowed(array: Any) -> Any:
@@ -81,34 +94,53 @@ def _cast_to_number(typing: Any, bits: Any) -> Any:
     return types.float64(types.uint64), generate
 
 
-def _in_registers(typing: Any, out: Any, start: Any, table: Any, row: Any, p: Any) -> Any:
-    """`_write_stage` as four and four doubles that become eight floats."""
+def _ask_for_lines(typing: Any, table: Any, row: Any, rows: Any) -> Any:
+    """`_fetch` as one instruction for each line of the cache."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array = context.make_array(table)(context, builder, arguments[0])
+        width = cgutils.unpack_tuple(builder, array.shape)[1]
+        first = builder.gep(array.data, [builder.mul(arguments[1], width)])
+        size = context.get_abi_sizeof(context.get_data_type(table.dtype))
+        count, per_line = builder.mul(arguments[2], width), ir.Constant(ir.IntType(64), _LINE // size)
+        flag, place = ir.IntType(32), ir.IntType(8).as_pointer()
+        kind = ir.FunctionType(ir.VoidType(), [place, flag, flag, flag])
+        ask = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        to_read, keep, data = (ir.Constant(flag, k) for k in (0, 3, 1))
+        with cgutils.for_range_slice(builder, ir.Constant(ir.IntType(64), 0), count, per_line) as (at, _):
+            line = builder.bitcast(builder.gep(first, [at]), place)
+            builder.call(ask, [line, to_read, keep, data])
+        return context.get_dummy_value()
+
+    return types.void(table, types.intp, types.intp), generate
+
+
+def _in_registers(typing: Any, out: Any, start: Any, previews: Any, row: Any, p: Any) -> Any:
+    """`_write_stage` as four doubles that become floats, three of which go before five that lie ready."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         out_array = context.make_array(out)(context, builder, arguments[0])
-        table_array = context.make_array(table)(context, builder, arguments[2])
-        width = cgutils.unpack_tuple(builder, table_array.shape)[1]
+        previews_array = context.make_array(previews)(context, builder, arguments[2])
+        width = cgutils.unpack_tuple(builder, previews_array.shape)[1]
         target = builder.gep(out_array.data, [arguments[1]])
-        source = builder.gep(table_array.data, [builder.mul(arguments[3], width)])
+        source = builder.gep(previews_array.data, [builder.mul(arguments[3], width)])
         doubles, floats = ir.VectorType(ir.DoubleType(), 4), ir.VectorType(ir.FloatType(), 4)
-        halves = [
-            builder.load(
-                builder.bitcast(builder.gep(source, [ir.Constant(ir.IntType(64), at)]), doubles.as_pointer()),
-                align=8,
-            )
-            for at in (0, 4)
-        ]
+        whole, lane = ir.VectorType(ir.FloatType(), 8), ir.IntType(32)
+        position = builder.load(builder.bitcast(source, doubles.as_pointer()), align=8)
         shift = ir.Constant(doubles, [0.0] * 4)
         for i, value in enumerate(cgutils.unpack_tuple(builder, arguments[4])):
-            shift = builder.insert_element(shift, value, ir.Constant(ir.IntType(32), i))
-        near = builder.fptrunc(builder.fsub(halves[0], shift), floats)
-        far = builder.fptrunc(halves[1], floats)
-        places = ir.Constant(ir.VectorType(ir.IntType(32), 8), list(range(8)))
-        whole = ir.VectorType(ir.FloatType(), 8).as_pointer()
-        builder.store(builder.shuffle_vector(near, far, places), builder.bitcast(target, whole), align=4)
+            shift = builder.insert_element(shift, value, ir.Constant(lane, i))
+        near = builder.fptrunc(builder.fsub(position, shift), floats)
+        near = builder.shuffle_vector(near, near, ir.Constant(ir.VectorType(lane, 8), [0, 1, 2, *[0] * 5]))
+        behind = builder.gep(source, [ir.Constant(ir.IntType(64), 3)])  # that 6 words behind comes to place 3
+        far = builder.load(builder.bitcast(behind, whole.as_pointer()), align=4)
+        places = ir.Constant(ir.VectorType(lane, 8), [0, 1, 2, *range(8 + 3, 8 + 8)])
+        builder.store(
+            builder.shuffle_vector(near, far, places), builder.bitcast(target, whole.as_pointer()), align=4
+        )
         return context.get_dummy_value()
 
-    return types.void(out, types.intp, table, types.intp, p), generate
+    return types.void(out, types.intp, previews, types.intp, p), generate
 
 
 def _nearer_in_registers(typing: Any, places: Any, at: Any, x: Any, y: Any, z: Any) -> Any:
@@ -140,13 +172,15 @@ def _nearer_in_registers(typing: Any, places: Any, at: Any, x: Any, y: Any, z: A
 write_stage: Any
 take_nearer: Any
 borrowed: Any
+fetch: Any
 bits_of: Any
 number_of: Any
 if getattr(config, "DISABLE_JIT", False):
     take_nearer = _take_nearer
     write_stage, borrowed = _write_stage, _borrowed
-    bits_of, number_of = _bits_of, _number_of
+    bits_of, number_of, fetch = _bits_of, _number_of, _fetch
 else:
     write_stage, borrowed = intrinsic(_in_registers), intrinsic(_without_count)
     take_nearer = intrinsic(_nearer_in_registers)
     bits_of, number_of = intrinsic(_cast_to_bits), intrinsic(_cast_to_number)
+    fetch = intrinsic(_ask_for_lines)

@@ -18,14 +18,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compilation.decorators import Int, inline_kernel
+from ..compilation.decorators import Int, inline_kernel, kernel
 from ..compilation.intrinsics import write_stage
+from ..compilation.packed import IntArray
 from ..lanes import COMMAND, COS_PSI, FORCES, PLANT, SIN_PSI, STEP, four, plus, twelve
 from ..plant import Array
 from ..rotations import sincos
 from ..table_row import N_REFERENCE as N_REFERENCE
+from ..table_row import SEEN
 
 N_OWN = 18
+Previews = NDArray[np.float32]
 
 
 class TrackingView(NamedTuple):
@@ -222,10 +225,44 @@ def decode_own(row: NDArray[np.float32], plant: Array, command: Array) -> None:
         command[i] = row[14 + i]
 
 
+@kernel
+def tabulate_previews(references: Array, index: IntArray, previews: Previews) -> None:
+    """Write what observations preview of reference tables.
+
+    Args:
+        references: All tables, (M, n_steps, N_TABLE).
+        index: Which of them, (m,).
+        previews: Result, (M, n_steps, N_PREVIEW), of all.
+    """
+    for m in range(index.size):
+        table, words = references[index[m]], previews[index[m]]
+        positions = words.view(np.float64)
+        for k in range(table.shape[0]):
+            for c in range(3):
+                positions[k, c] = table[k, c]
+            for c in range(3, N_REFERENCE):
+                words[k, SEEN - 3 + c] = table[k, c]
+
+
 @inline_kernel
 def encode_preview(
-    out: NDArray[np.float32], start: int, reference: Array, row: int, stages: int, p: Sequence[float] | Array
+    out: NDArray[np.float32],
+    start: int,
+    previews: Previews,
+    step: int,
+    stages: int,
+    p: Sequence[float] | Array,
 ) -> None:
-    """Write reference rows row..row+stages-1 from out[start] on, positions relative to p."""
+    """Write the reference from a step on, positions relative to p; the table's last rows hold on.
+
+    Args:
+        out: Observation, float32.
+        start: Where it stands.
+        previews: What is previewed of the reference, (n_steps, N_PREVIEW).
+        step: Control step.
+        stages: How many rows are seen.
+        p: Position of the vehicle, (>= 3,), m.
+    """
+    row = min(step, previews.shape[0] - stages)
     for q in range(stages):
-        write_stage(out, start + N_REFERENCE * q, reference, row + q, (p[0], p[1], p[2]))
+        write_stage(out, start + N_REFERENCE * q, previews, row + q, (p[0], p[1], p[2]))

@@ -14,15 +14,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import require_whole
-from ..compilation.decorators import kernel
+from ..compilation.decorators import entry_of, inline_kernel, kernel
+from ..compilation.packed import IntArray
 from ..names import shown
 from ..observations.tracking import N_REFERENCE
 from ..parameters import Array
 from ..rotations import sincos
+from ..table_row import COSINE, SINE
 from .plausible import FASTEST
 
 _RESTING_SPEED = 0.05  # m/s
 _MOST_HARMONICS = 1000
+_ROUNDING = 1e-9  # of steps of time, by which equal ones may differ
 
 
 @runtime_checkable
@@ -172,31 +175,75 @@ class Racetrack:
         return pack_rows(p, w * v)
 
 
+@inline_kernel
+def _turn(sine: Array, cosine: Array, s: float, c: float, later_sine: Array, later_cosine: Array) -> None:
+    """Sines and cosines of angles (n,) that are turned by the angle of sine s and cosine c."""
+    for k in range(later_sine.size):
+        later_sine[k], later_cosine[k] = sine[k] * c + cosine[k] * s, cosine[k] * c - sine[k] * s
+
+
+@inline_kernel
+def _sines(t: Array, w: float, phi: float, equal: bool, sine: Array, cosine: Array) -> None:
+    """Sine and cosine of w t + phi at all times (n,), where steps are equal by turning ever more of them."""
+    known = min(4, t.size) if equal else t.size
+    for k in range(known):
+        sine[k], cosine[k] = sincos(w * t[k] + phi)
+    while known < t.size:
+        s, c = sincos(w * (t[known] - t[0]))
+        end = min(2 * known, t.size)
+        _turn(sine, cosine, s, c, sine[known:end], cosine[known:end])
+        known = end
+
+
+@inline_kernel
+def _has_equal_steps(t: Array) -> bool:
+    """Whether times differ by the same step, but for rounding."""
+    equal = t.size > 1
+    for k in range(2, t.size):
+        equal &= abs((t[k] - t[k - 1]) - (t[1] - t[0])) <= _ROUNDING * (t[1] - t[0])
+    return equal
+
+
 @kernel
-def _sum_sines(t: Array, amplitude: Array, rate: Array, phase: Array, paths: Array, out: Array) -> None:
-    """Sums of a (sin(w t + phi) - sin(phi)) and their derivatives as rows of a reference.
+def tabulate_smooth(uniform: Array, choice: Array, t: Array, index: IntArray, out: Array) -> None:
+    """Tables of random sums of a (sin(w t + phi) - sin(phi)) and their derivatives.
 
     Args:
+        uniform: For each table three numbers in [0, 1) of each axis and harmonic, (m, 9 H): its share in the
+            amplitude, its rate, its phase.
+        choice: Bounds on the sum of the sines of each axis, m, and on their rates, rad/s, (5,).
         t: Times, (n,), s.
-        amplitude: Of each axis and harmonic, (3, H), m.
-        rate: (3, H), rad/s.
-        phase: (3, H), rad.
-        paths: Scratch, zeros, (6, n).
-        out: Result, (n, 8).
+        index: Which tables are written, (m,).
+        out: All tables, (M, n, >= 8); what is behind the heading is zero.
     """
-    for axis in range(3):
-        position, velocity = paths[axis], paths[3 + axis]
-        for i in range(amplitude.shape[1]):
-            a, w, phi = amplitude[axis, i], rate[axis, i], phase[axis, i]
-            first, _ = sincos(phi)
-            for k in range(t.size):
-                sine, cosine = sincos(w * t[k] + phi)
-                position[k] += a * (sine - first)
-                velocity[k] += a * w * cosine
-    for k in range(t.size):
-        for c in range(6):
-            out[k, c] = paths[c, k]
-        out[k, 6], out[k, 7] = 0.0, 1.0
+    drawn, paths = uniform.reshape(uniform.shape[0], 3, 3, uniform.shape[1] // 9), np.empty((6, t.size))
+    sine, cosine, equal = np.empty(t.size), np.empty(t.size), _has_equal_steps(t)
+    for m in range(index.size):
+        paths[:] = 0.0
+        for axis in range(3):
+            shares, position, velocity = drawn[m, 0, axis], paths[axis], paths[3 + axis]
+            total = 0.0
+            for i in range(shares.size):
+                total += shares[i]
+            for i in range(shares.size):
+                a = shares[i] / total * choice[axis]
+                w = choice[3] + (choice[4] - choice[3]) * drawn[m, 1, axis, i]
+                phi = 2.0 * math.pi * drawn[m, 2, axis, i]
+                first, _ = sincos(phi)
+                _sines(t, w, phi, equal, sine, cosine)
+                for k in range(t.size):
+                    position[k] += a * (sine[k] - first)
+                    velocity[k] += a * w * cosine[k]
+        table = out[index[m]]
+        for k in range(t.size):
+            for c in range(6):
+                table[k, c] = paths[c, k]
+            table[k, SINE], table[k, COSINE] = 0.0, 1.0
+            for c in range(N_REFERENCE, table.shape[1]):
+                table[k, c] = 0.0
+
+
+_tabulate_smooth = entry_of(tabulate_smooth)
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,16 +275,21 @@ class RandomSmooth:
                 f"{FASTEST:g} m/s: lower one of them"
             )
 
+    @property
+    def numbers(self) -> int:
+        """How many uniform numbers make a trajectory."""
+        return 9 * self.harmonics
+
     def rows(self, t: Array, rng: np.random.Generator) -> Array:
         """Reference rows of a new random trajectory, (n, 8)."""
-        draws = rng.random((3, 3, self.harmonics))
-        share = draws[0] / draws[0].sum(axis=1, keepdims=True)
-        amplitude = share * np.asarray(self.amplitude)[:, None]
-        rate = self.rate_min + (self.rate_max - self.rate_min) * draws[1]
-        phase = 2.0 * np.pi * draws[2]
-        paths, out = np.zeros((6, t.size)), np.empty((t.size, N_REFERENCE))
-        _sum_sines(np.ascontiguousarray(t), amplitude, rate, phase, paths, out)
-        return out
+        out = np.empty((1, t.size, N_REFERENCE))
+        self.tabulate(rng.random((1, self.numbers)), t, np.zeros(1, dtype=np.int64), out)
+        return np.asarray(out[0])
+
+    def tabulate(self, uniform: Array, t: Array, index: IntArray, out: Array) -> None:
+        """Write tables of random trajectories; arguments as in `tabulate_smooth`."""
+        choice = np.array([*self.amplitude, self.rate_min, self.rate_max])
+        _tabulate_smooth(np.ascontiguousarray(uniform), choice, np.ascontiguousarray(t), index, out)
 
 
 @dataclass(frozen=True, slots=True)

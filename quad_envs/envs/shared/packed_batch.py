@@ -35,9 +35,9 @@ class PackedBatch:
         """Where `begin` and `step` write their scores, see N_TOLD of the kernel."""
         return np.empty(self._told_shape)
 
-    def _place(self, vehicle: Array, force_max: Array, i: int | None = None) -> None:
-        """Which vehicle flies in place i, or in all: coefficients, and the largest force of each rotor."""
-        half = 0.5 * self.task.dt / self.options.substeps
-        self.vehicles.write(COEFFICIENTS, vehicle, i)
-        self.vehicles.write(FORCE_MAX, force_max, i)
-        self.vehicles.write(DECAY, np.exp(-half * vehicle[ROTOR_RATE : ROTOR_RATE + 1]), i)
+    def _place_nominal(self) -> None:
+        """Let all be the nominal vehicle."""
+        coefficients, half = self.task.params.coefficients(), 0.5 * self.task.dt / self.options.substeps
+        self.vehicles.write(COEFFICIENTS, coefficients)
+        self.vehicles.write(FORCE_MAX, self.task.force_max)
+        self.vehicles.write(DECAY, np.exp(-half * coefficients[ROTOR_RATE : ROTOR_RATE + 1]))

@@ -5,7 +5,6 @@ Everything that comes from a user's object is checked here, so that the compiled
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,6 @@ from ...references.plausible import FASTEST
 from ...table_row import N_TABLE
 from ...tasks import BaseTask
 from ...turning import tabulate
-from .vehicle_options import varied_params
 
 _tabulate = entry_of(tabulate)
 
@@ -82,18 +80,3 @@ def stage_times(task: BaseTask, substeps: int) -> Array:
     """Times of the integrator's stages in each control period, (episode_steps, 2 substeps + 1), s."""
     periods = np.arange(task.episode_steps, dtype=np.float64)[:, None]
     return np.asarray(task.dt * (periods + np.linspace(0.0, 1.0, 2 * substeps + 1)))
-
-
-def draw_vehicle(
-    task: BaseTask, randomization: Mapping[str, float], rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Coefficients and rotor saturation (4,) of a true vehicle; without randomization nothing is drawn."""
-    params, force_max = task.params, task.force_max
-    if randomization:
-        factors = {
-            name: 1.0 + spread * rng.uniform(-1.0, 1.0, 3 if name == "inertia" else None)
-            for name, spread in randomization.items()
-        }
-        force_max *= float(factors.get("kappa", 1.0))
-        params = varied_params(params, factors)
-    return params.coefficients(), force_max

@@ -235,32 +235,29 @@ class VehicleOptions(LimitOptions):
             )
         ranges = {name: float(value) for name, value in ranges.items() if value > 0.0}
         for sign in (-1.0, 1.0):  # what is drawn is made then; here it is refused if it could not be
-            varied_params(self.make_params(), {name: 1.0 + sign * value for name, value in ranges.items()})
+            extreme = varied(self.make_params(), {name: 1.0 + sign * value for name, value in ranges.items()})
+            replace(self.make_params(), **{name: as_tuple(value) for name, value in extreme.items()})
         return ranges
 
 
-def varied_params(params: QuadrotorParams, factors: Mapping[str, float | Array]) -> QuadrotorParams:
-    """A vehicle whose parameters are multiplied; kappa is none of them.
+def varied(params: QuadrotorParams, factors: Mapping[str, float | Array]) -> dict[str, Any]:
+    """Parameters that are multiplied, of one vehicle or many; kappa is none of them.
 
     Where the largest principal moment would exceed the sum of the others, as that of no body does, it is
     that sum.
 
     Args:
         params: The nominal vehicle.
-        factors: Parameter -> factor; of the inertia one, or three.
-
-    Raises:
-        ValueError: If a parameter would be beyond every vehicle.
+        factors: Parameter -> factor, (...); of the inertia (..., 3), or one.
     """
-    values: dict[str, Any] = {
-        name: getattr(params, name) * float(factor)
-        for name, factor in factors.items()
-        if name not in ("kappa", "inertia")
-    }
-    J = np.asarray(params.inertia) * factors.get("inertia", 1.0)
-    largest = int(np.argmax(J))
-    J[largest] = min(J[largest], J.sum() - J[largest])
-    return replace(params, inertia=tuple(J.tolist()), **values)
+    values: dict[str, Any] = {}
+    for name, factor in factors.items():
+        if name == "inertia":
+            J = np.asarray(params.inertia) * factor
+            values[name] = np.minimum(J, J.sum(axis=-1, keepdims=True) - J)
+        elif name != "kappa":
+            values[name] = getattr(params, name) * factor
+    return values
 
 
 def spread(name: str, value: float | tuple[float, ...], length: int) -> tuple[float, ...]:

@@ -26,17 +26,18 @@ from ...lanes import (
 )
 from ...names import nearest_name, shown, unknown_name
 from ...normals import key_of
-from ...observations.tracking import N_REFERENCE
+from ...observations.tracking import N_REFERENCE, tabulate_previews
 from ...plant import N_STATE, Array
 from ...references import make_reference, pack_rows
 from ...sensors import sensor_rows
-from ...table_row import N_TABLE
+from ...table_row import N_PREVIEW, N_TABLE
 from ...targets import N_TARGET, make_target
 from ...tasks import TeamTask
 from ..shared.draws import gusts_in_flight, make_draws
 from ..shared.given import given_plants
 from ..shared.packed_batch import PackedBatch
-from ..shared.tables import checked_rows, disturbance_rows, draw_vehicle, reference_rows, stage_times
+from ..shared.random_vehicles import random_vehicles
+from ..shared.tables import checked_rows, disturbance_rows, reference_rows, stage_times
 from ..shared.task_vector import task_vector
 from .exchange import (
     DISTURBANCE,
@@ -56,6 +57,7 @@ from .options import EstimationOptions, FormationOptions, TargetTrackingOptions,
 from .scores import N_LOSS
 from .told import Parts, TeamScores, parts_of, team_scores
 
+_tabulate_previews = entry_of(tabulate_previews)
 _step, _begin = entry_of(step_teams), entry_of(begin_teams)
 Generators = Sequence[np.random.Generator]
 _RESET_OPTIONS = ("state",)
@@ -100,6 +102,7 @@ class TeamBatch(PackedBatch):
                 self._offsets(),
                 self._which,
                 self.references,
+                self._previews,
                 self.disturbances,
                 self.noises,
                 self.targets,
@@ -113,7 +116,7 @@ class TeamBatch(PackedBatch):
         self._words = pack(self._arrays)
         self._constraints = len(self.task.constraint_names)
         self._told_shape = N_TOLD + 2 * self._constraints + N_LOSS, teams * self.n
-        self._place(*draw_vehicle(self.task, {}, np.random.default_rng(0)))
+        self._place_nominal()
         if isinstance(options, TargetTrackingOptions):
             for t in range(teams):
                 for i in options.informed():
@@ -130,7 +133,7 @@ class TeamBatch(PackedBatch):
     def _take_choices(self) -> None:
         """What is flown, and which of it is drawn at reset."""
         options = self.options
-        self._randomization = options.randomization()
+        self._vehicles = random_vehicles(self.task, options.randomization())
         self._reference = make_reference(
             options.reference if isinstance(options, FormationOptions) else "setpoint"
         )
@@ -177,6 +180,7 @@ class TeamBatch(PackedBatch):
         self._nodes = stage_times(self.task, options.substeps)
         tables = [np.zeros(shape) for shape in self._table_shapes()]
         self.references, self.disturbances, self.noises, self.targets, self._draws = tables
+        self._previews = np.zeros((*self.references.shape[:2], N_PREVIEW), dtype=np.float32)
         self._which = np.zeros((5, teams * n), dtype=np.int64)
         for kind in range(5):
             if self._random[kind]:
@@ -185,6 +189,7 @@ class TeamBatch(PackedBatch):
         first = reference_rows(self._reference, self._times, never)  # of a random one, to see that it works
         if not self._random[REFERENCE]:
             self.references[0] = first
+            _tabulate_previews(self.references, np.zeros(1, dtype=np.int64), self._previews)
         if self._disturbance is not None and not self._random[DISTURBANCE]:
             self.disturbances[0] = disturbance_rows(self._disturbance, self._nodes, dt, never)
         if self._target is not None and not self._random[TARGET]:
@@ -239,11 +244,12 @@ class TeamBatch(PackedBatch):
     def _draw(self, t: int, rng: np.random.Generator) -> None:
         """What else is drawn for team t."""
         first, n = t * self.n, self.n
-        if self._randomization:
-            for i in range(first, first + n):
-                self._place(*draw_vehicle(self.task, self._randomization, rng), i)
+        if self._vehicles.columns.size:
+            uniform, h = rng.random((n, self._vehicles.columns.size)), self.task.dt / self.options.substeps
+            self._vehicles.place(uniform, np.arange(first, first + n), self.vehicles, h)
         if self._random[REFERENCE]:
             self.references[t] = reference_rows(self._reference, self._times, rng)
+            _tabulate_previews(self.references, np.array([t]), self._previews)
         draws = self._arrays.draws
         if self._disturbance is not None and self._random[DISTURBANCE] and not draws.gusty:
             for i in range(first, first + n):

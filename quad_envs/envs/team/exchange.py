@@ -16,11 +16,11 @@ from ...compilation.decorators import Int, inline_kernel, kernel
 from ...compilation.packed import IntArray
 from ...lanes import ALIVE, HEARD, LANES, MOST_VALUES, STEP
 from ...observations.team import N_COMM, N_MEASURED, N_PLAN_STAGE, N_SENSED
-from ...observations.tracking import encode_preview, measured
+from ...observations.tracking import Previews, encode_preview, measured
 from ...plant import Array
 from ...rotations import sincos
 from ...sensors import AZIMUTH, RANGE, measure, reads
-from ...table_row import N_REFERENCE, N_TABLE
+from ...table_row import N_PREVIEW, N_REFERENCE, N_TABLE
 from ..shared.task_vector import DT, PREVIEW
 from ..tracking.kernel import encode_vehicle
 
@@ -65,6 +65,7 @@ class Tables(NamedTuple):
     offsets: Annotated[Array, "N, L, 3"]  # m, delta_ij per slot, then p_i* beside the leader or the target
     which: Annotated[IntArray, "5, n"]  # table of a vehicle: reference, disturbance, noise, target, draw
     references: Annotated[Array, f"M, T, {N_TABLE}"]  # tables, of the leader
+    previews: Annotated[Previews, f"M, T, {N_PREVIEW}"]  # of these
     disturbances: Annotated[Array, "M, T, L, 6"]  # tables
     noises: Annotated[Array, "M, T, 12"]  # tables, of the vehicles' own state; no steps for none
     targets: Annotated[Array, "M, T, 6"]  # tables, r and v of the target; no steps for none
@@ -275,7 +276,7 @@ def observe_agent(
     messages: Array,
     motions: Array,
     offsets: Array,
-    reference: Array,
+    previews: Previews,
     disturbance: Array,
     noise: Array,
     sensed: int,
@@ -294,7 +295,7 @@ def observe_agent(
         messages: What it heard, (K, HEAD + C).
         motions: True motions of the team, (N, 10).
         offsets: delta_ij per slot, then its slot, (K + 1, 3).
-        reference: The leader's, (n_steps, 9).
+        previews: What is previewed of the leader's reference, (n_steps, N_PREVIEW).
         disturbance: Its own, (n_steps, n_nodes, 6).
         noise: Its measurement errors, (n_steps, 12); no steps for none.
         sensed: How many vehicles it senses.
@@ -312,7 +313,7 @@ def observe_agent(
     at += 1
     stages = int(task[PREVIEW]) + 1
     if leads:
-        encode_preview(out, at, reference, min(k, reference.shape[0] - stages), stages, own)
+        encode_preview(out, at, previews, k, stages, own)
     else:
         for c in range(N_REFERENCE * stages):
             out[at + c] = 0.0

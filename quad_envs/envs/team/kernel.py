@@ -240,7 +240,7 @@ def _inform(
     key, near = rest[:sensed], rest[sensed : 2 * sensed]
     k = int(blocks[0, STEP])
     now = history[k % history.shape[0]]
-    reference = tables.references[tables.which[REFERENCE, first]]
+    previews = tables.previews[tables.which[REFERENCE, first]]
     target, draws = tables.targets[tables.which[TARGET, first]], tables.draws[tables.which[DRAW, first]]
     for i in range(n):
         w, j = blocks[i // LANES], i % LANES
@@ -261,7 +261,7 @@ def _inform(
             hear(k, i, blocks, first, history, tables, team, messages)
             count = sense(i, motions, places, squares, team, key, near)
             observe_agent(
-                i, w, told[i], now[i, MEASUREMENT:], messages, motions, tables.offsets[i], reference,
+                i, w, told[i], now[i, MEASUREMENT:], messages, motions, tables.offsets[i], previews,
                 tables.disturbances[tables.which[DISTURBANCE, first + i]],
                 tables.noises[tables.which[NOISE, first + i]], count, near, task, team, out[first + i],
             )  # fmt: skip

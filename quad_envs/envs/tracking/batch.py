@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,21 +16,39 @@ from ...disturbances import Disturbance
 from ...lanes import LANES, N_PLANT, N_TRACKING, Blocks
 from ...names import shown
 from ...normals import key_of
+from ...observations.tracking import tabulate_previews
 from ...plant import N_STATE, POSITION, Array
-from ...references import Reference, make_reference, state_on
-from ...table_row import N_TABLE
+from ...references import RandomSmooth, Reference, make_reference, state_on
+from ...table_row import N_PREVIEW, N_TABLE
 from ...tasks import Task
 from ..shared.draws import gusts_in_flight, make_draws
 from ..shared.given import given_plants
 from ..shared.packed_batch import PackedBatch
-from ..shared.tables import disturbance_rows, draw_vehicle, reference_rows, stage_times
+from ..shared.random_vehicles import random_vehicles
+from ..shared.tables import disturbance_rows, reference_rows, stage_times
 from ..shared.task_vector import task_vector
 from .kernel import N_TOLD, Flights, begin_flights, step_flights, tell_flights
 from .options import TrackingOptions
 from .scores import Scores, scores_of
 
+_tabulate_previews = entry_of(tabulate_previews)
 _step, _begin, _tell = entry_of(step_flights), entry_of(begin_flights), entry_of(tell_flights)
 Generators = Sequence[np.random.Generator]
+
+
+class _Drawn(NamedTuple):
+    """Which uniform numbers a flight draws when it begins: its start, (12,), and what follows."""
+
+    vehicle: slice
+    reference: slice
+    key: bool  # whether it draws that of gusts and noise, which is the last
+    first: int  # those that are drawn before objects draw, the rest comes after
+    objects: bool  # whether reference or disturbance draws by itself
+
+    @property
+    def size(self) -> int:
+        """How many they are."""
+        return self.first + self.key
 
 
 class TrackingBatch(PackedBatch):
@@ -58,25 +76,29 @@ class TrackingBatch(PackedBatch):
         blown = 1 if gusts_in_flight(self._disturbance) else steps if self._disturbance else 0
         disturbances = (count[1], blown, nodes, 6)
         noises = (count[2], 1 if random[2] else 0, N_STATE)
-        seen = (n, self.task.layout.size)
+        seen, previews = (n, self.task.layout.size), (*references[:2], N_PREVIEW // 2)
         require_memory(
             f"{shown(n)} flights of {steps} steps",
-            array_bytes((n, N_TRACKING // LANES), references, disturbances, noises, (steps, nodes), seen),
+            array_bytes(
+                (n, N_TRACKING // LANES), references, previews, disturbances, noises, (steps, nodes), seen
+            ),
             "choose fewer of them, shorter ones, a shorter preview, or fewer substeps",
         )
         self.vehicles = Blocks(n, N_TRACKING)
-        self._randomization = options.randomization()
+        self._vehicles = random_vehicles(self.task, options.randomization())
         self._start, self._widths = options.start_state(), options.start_half_widths()
         self._times: Array = dt * np.arange(references[1], dtype=np.float64)
         self._nodes = stage_times(self.task, options.substeps)
         never = np.random.default_rng(0)
         self.references: Array = np.zeros(references)
+        self._previews = np.zeros((*references[:2], N_PREVIEW), dtype=np.float32)
         self.disturbances: Array = np.zeros(disturbances)
         self.noises: Array = np.zeros(noises)
         first = reference_rows(self._reference, self._times, never)  # of a random one, to see that it works
         options.require_near(first[0, POSITION])
         if not random[0]:
             self.references[0] = first
+            _tabulate_previews(self.references, np.zeros(1, dtype=np.int64), self._previews)
         if self._disturbance is not None and not random[1]:
             self.disturbances[0] = disturbance_rows(self._disturbance, self._nodes, dt, never)
         self._random = random
@@ -84,21 +106,37 @@ class TrackingBatch(PackedBatch):
         for table in range(3):
             if random[table]:
                 self.which[table] = np.arange(n)
-        self._place(*draw_vehicle(self.task, {}, never))
+        self._place_nominal()
         self._arrays = Flights(
             self.vehicles.array,
             self.references,
+            self._previews,
             self.disturbances,
             self.noises,
             self.which,
             make_draws(self._disturbance, self.task, options.substeps, n, self.vehicles.count),
             task_vector(self.task, options.substeps, options.lost_distance),
         )
+        self._drawn = self._uniform_numbers()
         self._told_shape = N_TOLD + len(self.task.constraint_names), n
         self._words = pack(self._arrays)
         self._blocks = self.vehicles.count
         threads = min(threads, self._blocks)
         self._threads = Threads(threads) if threads > 1 else None
+
+    def _uniform_numbers(self) -> _Drawn:
+        """What the flights of this task draw."""
+        vehicle = N_STATE + self._vehicles.columns.size
+        reference = vehicle + (self._reference.numbers if isinstance(self._reference, RandomSmooth) else 0)
+        draws = self._arrays.draws
+        own_reference = self._random[0] and reference == vehicle
+        return _Drawn(
+            vehicle=slice(N_STATE, vehicle),
+            reference=slice(vehicle, reference),
+            key=draws.gusty or draws.noisy,
+            first=reference,
+            objects=own_reference or (self._random[1] and not draws.gusty),
+        )
 
     def scores(self, told: Array) -> Scores:
         """What is told there."""
@@ -127,12 +165,16 @@ class TrackingBatch(PackedBatch):
         Raises:
             ValueError: If a start is lost already.
         """
-        draws = np.empty((len(index), N_STATE))
-        varied = bool(self._randomization) or any(self._random)
-        for draw, i, rng in zip(draws, index.tolist(), generators, strict=True):
-            rng.random(out=draw)
-            if varied:
+        uniform = np.empty((len(index), self._drawn.size))
+        for row, i, rng in zip(uniform, index.tolist(), generators, strict=True):
+            if self._drawn.objects:
+                rng.random(out=row[: self._drawn.first])
                 self._draw(i, rng)
+                rng.random(out=row[self._drawn.first :])
+            else:
+                rng.random(out=row)
+        self._take(index, uniform)
+        draws = uniform[:, :N_STATE]
         if states is None:
             plants = np.full((len(index), N_PLANT), self.task.hover_force)
             plants[:, :N_STATE] = self._start + self._widths * (2.0 * draws - 1.0)
@@ -149,16 +191,24 @@ class TrackingBatch(PackedBatch):
             )
 
     def _draw(self, i: int, rng: np.random.Generator) -> None:
-        """What else is drawn for flight i."""
-        if self._randomization:
-            self._place(*draw_vehicle(self.task, self._randomization, rng), i)
-        if self._random[0]:
+        """What reference and disturbance draw for flight i by themselves."""
+        if self._random[0] and not isinstance(self._reference, RandomSmooth):
             self.references[i] = reference_rows(self._reference, self._times, rng)
-        draws = self._arrays.draws
-        if self._disturbance is not None and self._random[1] and not draws.gusty:
+        if self._disturbance is not None and self._random[1] and not self._arrays.draws.gusty:
             self.disturbances[i] = disturbance_rows(self._disturbance, self._nodes, self.task.dt, rng)
-        if draws.gusty or draws.noisy:
-            draws.keys[i] = key_of(rng.random())
+
+    def _take(self, index: IntArray, uniform: Array) -> None:
+        """What follows from the uniform numbers (m, `_drawn.size`) of flights that begin."""
+        drawn = self._drawn
+        if self._vehicles.columns.size:
+            h = self.task.dt / self.options.substeps
+            self._vehicles.place(uniform[:, drawn.vehicle], index, self.vehicles, h)
+        if isinstance(self._reference, RandomSmooth):
+            self._reference.tabulate(uniform[:, drawn.reference], self._times, index, self.references)
+        if self._random[0]:
+            _tabulate_previews(self.references, index, self._previews)
+        if drawn.key:
+            self._arrays.draws.keys[index] = key_of(uniform[:, -1])
 
     def tell(self, index: IntArray, out: NDArray[np.float32], told: Array) -> None:
         """Write observations and scores of flights as they are; arguments as in `begin`."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...compilation.decorators import Int, fused, inline_kernel, inline_lane_kernel, kernel, lane_kernel
-from ...compilation.intrinsics import borrowed
+from ...compilation.intrinsics import borrowed, fetch
 from ...compilation.packed import IntArray, unpacker
 from ...constraints import TOLERANCE, force_from_action
 from ...dynamics import arrive, calm_substep, depart, disturbed_substep, load_air, sincos_in_lanes
@@ -47,10 +47,17 @@ from ...lanes import (
     six,
     twelve,
 )
-from ...observations.tracking import N_OWN, encode_disturbance, encode_own, encode_preview, measured
+from ...observations.tracking import (
+    N_OWN,
+    Previews,
+    encode_disturbance,
+    encode_own,
+    encode_preview,
+    measured,
+)
 from ...plant import N_INPUT, N_STATE, Array
 from ...reward import stage_cost_parts
-from ...table_row import N_TABLE
+from ...table_row import N_PREVIEW, N_TABLE
 from ...tasks import CRASH_CAUSES
 from ..shared.draws import Draws, draw_ahead
 from ..shared.task_vector import (
@@ -90,6 +97,7 @@ class Flights(NamedTuple):
 
     blocks: Annotated[Array, "B, S"]  # n / LANES + 1; the last one is for those that begin
     references: Annotated[Array, f"M, T, {N_TABLE}"]  # tables
+    previews: Annotated[Previews, f"M, T, {N_PREVIEW}"]  # of these
     disturbances: Annotated[Array, "M, T, L, 6"]  # tables, L = 2 substeps + 1; no steps for none
     noises: Annotated[Array, "M, T, 12"]  # tables; no steps for none
     which: Annotated[IntArray, "3, n"]  # reference, disturbance and noise table of each vehicle
@@ -259,7 +267,7 @@ def encode_vehicle(
 def observe(
     w: Array,
     j: Int,
-    reference: Array,
+    previews: Previews,
     disturbance: Array,
     noise: Array,
     task: Array,
@@ -270,16 +278,15 @@ def observe(
     Args:
         w: Block.
         j: Lane.
-        reference: Its reference table, (n_steps, N_TABLE).
+        previews: What is previewed of its reference, (n_steps, N_PREVIEW).
         disturbance: Its disturbance table, (n_steps, n_nodes, 6).
         noise: Its measurement errors, (n_steps, 12); no steps for none.
         task: Task vector.
         out: (layout.size,) float32.
     """
     x, yaw = measured(w, j, noise)
-    start, step = encode_vehicle(w, j, x, yaw, disturbance, task, out), int(w[STEP + j])
-    stages = int(task[PREVIEW]) + 1
-    encode_preview(out, start, reference, min(step, reference.shape[0] - stages), stages, x)
+    start = encode_vehicle(w, j, x, yaw, disturbance, task, out)
+    encode_preview(out, start, previews, int(w[STEP + j]), int(task[PREVIEW]) + 1, x)
 
 
 @inline_kernel
@@ -297,7 +304,7 @@ def tell(w: Array, j: Int, i: int, flights: Flights, out: NDArray[np.float32], t
     observe(
         w,
         j,
-        flights.references[which[0, i]],
+        flights.previews[which[0, i]],
         flights.disturbances[which[1, i]],
         flights.noises[which[2, i]],
         flights.task,
@@ -310,6 +317,26 @@ def foresee(w: Array, j: Int, i: int, flights: Flights) -> None:
     """Draw what vehicle i, which is in lane j, meets after the present step."""
     tables = flights.disturbances, flights.noises
     draw_ahead(flights.draws, i, i // LANES, int(w[STEP + j]), *tables, flights.which[1:, i])
+
+
+@inline_kernel
+def await_rows(w: Array, lanes: int, first: int, flights: Flights) -> None:
+    """Ask for the rows of their own references that the vehicles of a block need after its step.
+
+    Many tables are too large for the cache, and would be waited for one by one.
+
+    Args:
+        w: Block.
+        lanes: Vehicles in it.
+        first: The first of them.
+        flights: The flights.
+    """
+    stages = int(flights.task[PREVIEW]) + 1
+    if flights.references.shape[0] > 1:
+        for j in range(lanes):
+            table, step = flights.which[0, first + j], int(w[STEP + j])
+            fetch(flights.references[table], min(step, flights.references.shape[1] - 1), 1)
+            fetch(flights.previews[table], min(step, flights.previews.shape[1] - stages), stages)
 
 
 @inline_kernel
@@ -404,6 +431,7 @@ def step_flights(
             for a in range(N_INPUT):
                 w[ACTION + a * LANES + j] = actions[first + j, a]
         command(w, task)
+        await_rows(w, lanes, first, flights)
         fly(w, lanes, first, flights.disturbances, flights.which[1], task)
         for j in range(lanes):
             want(w, j, flights.references[flights.which[0, first + j]])
