@@ -24,6 +24,9 @@ def env(**kwargs: Any) -> AECEnv[str, Any, Any]:
     return parallel_to_aec(parallel_env(**kwargs))
 
 
-def vector_env(num_teams: int = 1, *, autoreset_mode: str = "NextStep", **kwargs: Any) -> TeamVectorEnv:
-    """Many teams in one compiled call; every agent is a row."""
-    return TeamVectorEnv(EstimationOptions.from_kwargs(kwargs), num_teams, autoreset_mode=autoreset_mode)
+def vector_env(
+    num_teams: int = 1, *, autoreset_mode: str = "NextStep", threads: int = 1, **kwargs: Any
+) -> TeamVectorEnv:
+    """Many teams in one compiled call, on several threads if you like; every agent is a row."""
+    options = EstimationOptions.from_kwargs(kwargs)
+    return TeamVectorEnv(options, num_teams, autoreset_mode=autoreset_mode, threads=threads)

@@ -43,6 +43,11 @@ class Threads:
             wait(others)  # nobody still writes when this returns
         return [own, *(other.result() for other in others)]
 
+    def shares(self, units: int, work: Callable[[int, int, int], _Result]) -> list[_Result]:
+        """What work(thread, begin, end) returns in each thread, which do an equal share of the units each."""
+        cuts = [units * k // self.count for k in range(self.count + 1)]
+        return self.each(lambda thread: work(thread, cuts[thread], cuts[thread + 1]))
+
     def run(self, rows: int, work: Callable[[int, int, int], int]) -> int:
         """Let the threads work until all rows are done; each takes the next few when it has done its last.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from ...checks import array_bytes, require_memory
 from ...compilation.decorators import entry_of
 from ...compilation.packed import IntArray, pack
+from ...compilation.threads import Threads
 from ...constraints import constraint_scales
 from ...formations import start_positions
 from ...graphs import in_neighbours
@@ -73,7 +75,7 @@ class TeamBatch(PackedBatch):
     task: TeamTask
     _arrays: Teams
 
-    def __init__(self, options: TeamOptions, teams: int) -> None:
+    def __init__(self, options: TeamOptions, teams: int, threads: int = 1) -> None:
         self.options, self.teams, self.task = options, teams, options.task
         self.n = options.vehicles
         self.slots, self.graphs = np.array(self.task.slots), options.graphs
@@ -83,6 +85,7 @@ class TeamBatch(PackedBatch):
             (teams * self.n, layout.neighbours, HEAD + content),
             (teams, options.delay + 1, self.n, content),
         )
+        threads = min(threads, teams)
         self._take_choices()
         self._require_memory((teams * self.n, N_TEAM // LANES), *shapes)
         self.vehicles = Blocks(teams * self.n, N_TEAM, self.n)
@@ -110,10 +113,11 @@ class TeamBatch(PackedBatch):
             ),
             task_vector(self.task, options.substeps, math.inf),
             _team_vector(options),
-            np.zeros(scratch_size(self.n, layout.sensed)),
+            np.zeros((threads, scratch_size(self.n, layout.sensed))),
             make_draws(self._disturbance, self.task, options.substeps, teams * self.n, self.vehicles.count),
         )
         self._words = pack(self._arrays)
+        self._threads = Threads(threads) if threads > 1 else None
         self._constraints = len(self.task.constraint_names)
         self._told_shape = N_TOLD + 2 * self._constraints + N_LOSS, teams * self.n
         self._place_nominal()
@@ -311,7 +315,8 @@ class TeamBatch(PackedBatch):
         Raises:
             ValueError: If an action is not finite; then nobody has moved.
         """
-        bad = _step(self._words, actions, out, told, self._constraints)
+        step = partial(_step, self._words, actions, out, told, self._constraints)
+        bad = step(0, 0, self.teams) if self._threads is None else min(self._threads.shares(self.teams, step))
         if bad >= 0:
             row, entry = divmod(bad, self.task.action_size)
             raise ValueError(

@@ -29,6 +29,7 @@ from ...lanes import (
     MEASURES,
     MOVED,
     N_PLANT,
+    N_TEAM,
     NEAREST,
     PLANT,
     REWARD,
@@ -90,13 +91,13 @@ N_TOLD = FLAGS + 1
 class Teams(NamedTuple):
     """What many teams consist of, packed for the kernels."""
 
-    blocks: Annotated[Array, "B, S"]  # those of one team after the other; the last one is to set aside
+    blocks: Annotated[Array, "B, S"]  # those of one team after the other, and one more
     messages: Annotated[Array, "n, K, C"]  # what each vehicle heard, HEAD and content
     history: Annotated[Array, "M, D, N, C"]  # contents of the last steps of each team
     tables: Tables
     task: Annotated[Array, "S"]  # task vector
     team: Annotated[Array, "S"]  # team vector
-    scratch: Annotated[Array, "S"]  # (scratch_size,)
+    scratch: Annotated[Array, "K, S"]  # of each thread, (scratch_size,)
     draws: Draws
 
 
@@ -111,11 +112,26 @@ class Told(NamedTuple):
 
 
 def scratch_size(vehicles: int, sensed: int) -> int:
-    """Numbers that a team needs as scratch: places, motions, what is told, places again, who is near."""
-    return -(-vehicles // LANES) * _POINT + (2 * N_MOTION + 4) * vehicles + 2 * sensed + 6
+    """Numbers of a `Scratch`; behind its places: motions, what is told, places again, who is near."""
+    return N_TEAM + -(-vehicles // LANES) * _POINT + (2 * N_MOTION + 4) * vehicles + 2 * sensed + 6
 
 
 _teams = unpacker(Teams)
+
+
+class Scratch(NamedTuple):
+    """Memory of a thread while it moves a team."""
+
+    aside: Array  # a block for vehicles that left
+    places: Array  # a _POINT for each block of the team
+    rest: Array
+
+
+@inline_kernel
+def _scratch(teams: Teams, thread: int, each: int) -> Scratch:
+    """The scratch of a thread for teams of so many blocks."""
+    memory, places = teams.scratch[thread], N_TEAM + each * _POINT
+    return Scratch(memory[:N_TEAM], memory[N_TEAM:places], memory[places:])
 
 
 @inline_kernel
@@ -351,8 +367,11 @@ def step_teams(
     flat_out: NDArray[np.float32],
     told_block: Array,
     constraints: int,
+    thread: int,
+    begin: int,
+    end: int,
 ) -> int:
-    """One control period of every team.
+    """One control period of teams begin..end-1.
 
     Args:
         words: The `Teams`, packed.
@@ -360,6 +379,9 @@ def step_teams(
         flat_out: Observations, (n layout.size,).
         told_block: Scores of all, see N_TOLD.
         constraints: Number of named constraints.
+        thread: Which thread this is.
+        begin: First team.
+        end: Team before which to stop.
 
     Returns:
         -1, or the flat index of the first non-finite action; then nothing was changed.
@@ -373,9 +395,8 @@ def step_teams(
     tables, task, team = teams.tables, teams.task, teams.team
     n = tables.neighbours.shape[0]
     each = (teams.blocks.shape[0] - 1) // (all_ // n)
-    aside = teams.blocks[teams.blocks.shape[0] - 1]
-    places, rest = teams.scratch[: each * _POINT], teams.scratch[each * _POINT :]
-    for t in range(all_ // n):
+    aside, places, rest = _scratch(teams, thread, each)
+    for t in range(begin, end):
         blocks, first = teams.blocks[t * each : (t + 1) * each], t * n
         if team[ON_RAILS] > 0.0:
             _ride(blocks, first, tables, actions, task, rest)
@@ -414,8 +435,7 @@ def begin_teams(
     tables, task, team = teams.tables, teams.task, teams.team
     n = tables.neighbours.shape[0]
     each = (teams.blocks.shape[0] - 1) // (all_ // n)
-    aside = teams.blocks[teams.blocks.shape[0] - 1]
-    places, rest = teams.scratch[: each * _POINT], teams.scratch[each * _POINT :]
+    aside, places, rest = _scratch(teams, 0, each)
     for m in range(index.size):
         t = index[m]
         blocks, first = teams.blocks[t * each : (t + 1) * each], t * n

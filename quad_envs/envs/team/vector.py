@@ -37,9 +37,11 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
         options: Of the task.
         num_teams: Number of teams n.
         autoreset_mode: NEXT_STEP (default) or DISABLED.
+        threads: Threads that share the teams of a step, at most one for each. Results do not depend on it;
+            below a thousand vehicles one thread is the fastest, and more than there are cores are slow.
 
     Raises:
-        ValueError: If num_teams < 1 or the mode is SAME_STEP.
+        ValueError: If num_teams or threads < 1, or the mode is SAME_STEP.
     """
 
     def __init__(
@@ -48,12 +50,14 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
         num_teams: int = 1,
         *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        threads: int = 1,
     ) -> None:
         require_whole("num_teams", num_teams, 1)
+        require_whole("threads", threads, 1)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
             raise ValueError("autoreset_mode must be NEXT_STEP or DISABLED for teams")
-        self._batch = TeamBatch(options, int(num_teams))
+        self._batch = TeamBatch(options, int(num_teams), int(threads))
         self.num_teams, self.num_envs = int(num_teams), int(num_teams) * options.vehicles
         self.render_mode = None
         self.metadata = {"render_modes": [], "render_fps": 20, "autoreset_mode": self.autoreset_mode}

@@ -249,9 +249,8 @@ class TrackingBatch(PackedBatch):
         self, threads: Threads, actions: NDArray[np.float32], out: NDArray[np.float32], told: Array
     ) -> int:
         """As the kernel of `step`; each thread moves an equal share of the blocks."""
-        cuts = [self._blocks * k // threads.count for k in range(threads.count + 1)]
-        found = threads.each(
-            lambda thread: _step(self._words, actions, out, told, cuts[thread], cuts[thread + 1])
+        found = threads.shares(
+            self._blocks, lambda _, begin, end: _step(self._words, actions, out, told, begin, end)
         )
         return min(found) if min(found) < 0 else sum(found)
 
