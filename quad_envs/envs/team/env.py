@@ -246,7 +246,7 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
         """Rewards, terminations, truncations and infos of the agents; arrays are rows of one of the team."""
         rewards, *numbers = parts.numbers.tolist()
         crashed, truncated, violated, terminated, _ = parts.flags.tolist()
-        columns = *numbers, *parts.counts.tolist(), crashed, violated
+        columns = *numbers, *parts.counts.tolist(), crashed, violated, parts.values, parts.terms
         infos = [
             {
                 "cost": cost,
@@ -262,11 +262,9 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
                 "messages": heard,
                 "reward_terms": terms,
             }
-            for (
-                (loss, cost, total, error, nearest, clipped, cause, heard, crashes, violates),
-                values,
-                terms,
-            ) in zip(zip(*columns, strict=True), parts.values, parts.terms, strict=True)
+            for loss, cost, total, error, nearest, clipped, cause, heard, crashes, violates, values, terms in zip(
+                *columns, strict=True
+            )
         ]
         return (
             dict(zip(agents, rewards, strict=True)),
