@@ -247,6 +247,7 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
         rewards, *numbers = parts.numbers.tolist()
         crashed, truncated, violated, terminated, _ = parts.flags.tolist()
         columns = *numbers, *parts.counts.tolist(), crashed, violated, parts.values, parts.terms
+        told = zip(*columns, strict=True)
         infos = [
             {
                 "cost": cost,
@@ -258,13 +259,11 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
                 "crash_cause": cause,
                 "clipped_actions": clipped,
                 "formation_error": error,
-                "min_separation": nearest,
+                "min_separation": near,
                 "messages": heard,
                 "reward_terms": terms,
             }
-            for loss, cost, total, error, nearest, clipped, cause, heard, crashes, violates, values, terms in zip(
-                *columns, strict=True
-            )
+            for loss, cost, total, error, near, clipped, cause, heard, crashes, violates, values, terms in told
         ]
         return (
             dict(zip(agents, rewards, strict=True)),
