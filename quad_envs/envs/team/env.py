@@ -253,7 +253,7 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
                 "cost": cost,
                 "episode_cost": total,
                 "constraint_violation": violates,
-                "constraint_values": values,
+                "constraint_values": value,
                 "stage_cost": loss,
                 "crashed": crashes,
                 "crash_cause": cause,
@@ -263,7 +263,7 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
                 "messages": heard,
                 "reward_terms": terms,
             }
-            for loss, cost, total, error, near, clipped, cause, heard, crashes, violates, values, terms in told
+            for loss, cost, total, error, near, clipped, cause, heard, crashes, violates, value, terms in told
         ]
         return (
             dict(zip(agents, rewards, strict=True)),
