@@ -22,6 +22,7 @@ from .cli.options import (
     TrainOptions,
     TuneOptions,
     WarmOptions,
+    WorkerOptions,
     add_options,
     read_options,
     refuse_unknown,
@@ -113,10 +114,17 @@ def _warm(options: WarmOptions) -> int:
     return warm.compile_all(options)
 
 
+def _worker(options: WorkerOptions) -> int:
+    from .cli import worker
+
+    return worker.join(options)
+
+
 COMMANDS: dict[str, Command] = {
     "list": Command(ListOptions, _list),
     "evaluate": Command(EvaluateOptions, _evaluate),
     "benchmark": Command(BenchmarkOptions, _benchmark),
+    "worker": Command(WorkerOptions, _worker),
     "train": Command(TrainOptions, _train),
     "tune": Command(TuneOptions, _tune),
     "export": Command(ExportOptions, _export),

@@ -9,6 +9,7 @@ results.csv        one row per environment x policy x flight (x vehicle), when a
 summary.csv        one row per environment x policy
 failures.json      policies that could not be made or broke off, where, and why
 contenders.csv     one row per table x environment x contender, where policies have seeds: all of them are one
+claims/            who is at what, where several processes share the folder
 networks/          folders of networks, see training/run_folder.py, and of tuned controllers
 """
 
@@ -46,9 +47,12 @@ _RESULTS = (
     "report.html",
     "replay.html",
     "cells/*.json",
+    "cells/*.failed",
+    "claims/*",
     "episodes/*.npz",
 )
 RESULTS_FORMAT = 3  # of the folder; 2 had one cell per unit, 1 neither this number nor tasks in cells
+_SOURCES = (".py", ".toml", ".json", ".safetensors")
 _DISTRIBUTIONS = ("gymnasium", "pettingzoo", "numpy", "scipy", "numba", "osqp", "joblib")
 
 
@@ -206,6 +210,33 @@ def locked(folder: Path) -> Iterator[None]:
                 file.truncate(0)
 
 
+@contextmanager
+def claimed(path: Path) -> Iterator[bool]:
+    """Hold a lock file, which is made if need be; gives whether it is ours, or another process has it.
+
+    Raises:
+        ResultsError: If it cannot be made or locked.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = open(path, "a+", encoding="utf-8")
+    except OSError as error:
+        raise ResultsError(
+            f"cannot write {str(path)!r}: {error.strerror or error}; choose another folder"
+        ) from error
+    with file:
+        try:
+            _acquire(file.fileno())
+        except (BlockingIOError, PermissionError):
+            yield False
+            return
+        except OSError as error:
+            raise ResultsError(
+                f"cannot lock {str(path)!r}: {error.strerror or error}; choose a folder on another disk"
+            ) from error
+        yield True
+
+
 def _acquire(descriptor: int) -> None:
     """Lock an open file at once, or raise."""
     if sys.platform == "win32":
@@ -243,11 +274,12 @@ def provenance() -> dict[str, Any]:
 
 
 def source_digest() -> str:
-    """Digest of the sources of the three packages, so that results of different code are not mixed."""
+    """Digest of the three packages and what they bring, so that results of different code are not mixed."""
     home, digest = Path(quad_envs.__file__).resolve().parents[1], hashlib.sha256()
     for package in ("quad_envs", "controllers", "baselines"):
-        for path in sorted((home / package).rglob("*.py")):
-            digest.update(str(path.relative_to(home)).encode() + path.read_bytes())
+        for path in sorted((home / package).rglob("*")):
+            if path.suffix in _SOURCES:
+                digest.update(str(path.relative_to(home)).encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 
 

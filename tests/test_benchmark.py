@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 import baselines.files
+import baselines.sweeps.crews
 import baselines.sweeps.store
-import baselines.sweeps.sweep
 from baselines import Results, ResultsError, Suite, load_suite, run_benchmark
 from baselines.evaluation.evaluate import Evaluation
 from baselines.files import locked, plain_json, write_atomic, write_csv
@@ -54,13 +54,13 @@ def finished(tmp_path_factory):
 def flown(monkeypatch):
     """Titles of the units that are flown."""
     titles = []
-    real = baselines.sweeps.sweep.fly_unit
+    real = baselines.sweeps.crews.fly_unit
 
     def count(unit):
         titles.append((unit.env.title, unit.policy.title))
         return real(unit)
 
-    monkeypatch.setattr(baselines.sweeps.sweep, "fly_unit", count)
+    monkeypatch.setattr(baselines.sweeps.crews, "fly_unit", count)
     return titles
 
 

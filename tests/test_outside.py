@@ -310,11 +310,11 @@ def test_the_command_benchmark_takes_policies_and_ends_with_one_if_some_broke_of
 
 
 def test_policies_from_outside_fly_again_since_their_code_may_have_changed(theirs, folder, monkeypatch):
-    import baselines.sweeps.sweep
+    import baselines.sweeps.crews
 
     run_benchmark(SMALL, folder / "out", policies={"mine": "their_policy:make"})
-    flown, real = [], baselines.sweeps.sweep.fly_unit
-    monkeypatch.setattr(baselines.sweeps.sweep, "fly_unit", lambda unit: flown.append(unit) or real(unit))
+    flown, real = [], baselines.sweeps.crews.fly_unit
+    monkeypatch.setattr(baselines.sweeps.crews, "fly_unit", lambda unit: flown.append(unit) or real(unit))
     run_benchmark(SMALL, folder / "out", policies={"mine": "their_policy:make"})
     assert [unit.policy.title for unit in flown] == ["mine"]
 

@@ -72,7 +72,9 @@ class BenchmarkOptions:
     out: Annotated[Path | None, "results folder; runs/SUITE-DATE-TIME if not given"] = None
     episodes: Annotated[int | None, "flights per environment and policy, instead of the suite's"] = None
     seed: Annotated[int | None, "environment seed of the first flight, instead of the suite's"] = None
-    engine: Annotated[str, "who runs the units: processes, ray or dask"] = "processes"
+    engine: Annotated[str, "who runs units: processes, ray, dask, or folder, which workers join"] = (
+        "processes"
+    )
     jobs: Annotated[int | None, "units flown at a time; 1, or all that a cluster has, if not given"] = None
     fresh: Annotated[bool, "discard what the folder holds of an earlier run, but for networks"] = False
     networks: Annotated[
@@ -197,6 +199,13 @@ class CertifyOptions:
     )
     json: Annotated[bool, "print JSON"] = False
     out: Annotated[Path | None, "folder for certify.json and the figures"] = None
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerOptions:
+    """Take part in a sweep that `benchmark --engine folder` has begun."""
+
+    folder: Annotated[Path, Positional("its results folder")]
 
 
 @dataclass(frozen=True, slots=True)

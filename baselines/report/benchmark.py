@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import KW_ONLY, dataclass, replace
@@ -12,6 +13,7 @@ from typing import Any
 
 from quad_envs.field_comments import called_with
 
+from ..errors import ResultsError
 from ..evaluation.amounts import require_jobs
 from ..files import locked, write_atomic
 from ..policies.environments import make_env
@@ -19,13 +21,13 @@ from ..policies.outside import name_of
 from ..policies.registry import behind_filter, from_outside, is_trained, make_policy, policy_entry
 from ..sweeps.choices import PolicyChoice
 from ..sweeps.comparison import Results
-from ..sweeps.engines import check_engine
+from ..sweeps.engines import SHARED_FOLDER, check_engine
 from ..sweeps.finished import check_unit
-from ..sweeps.folder import read_run
+from ..sweeps.folder import read_config, read_run
 from ..sweeps.protocol import require_disjoint_starts
 from ..sweeps.suite import Suite
 from ..sweeps.suite_files import load_suite
-from ..sweeps.sweep import Order, Sweep, with_given
+from ..sweeps.sweep import Order, Sweep, Watcher, with_given
 from ..sweeps.units import Given, Unit, suite_units, training_units
 from .build import render_report
 
@@ -91,6 +93,8 @@ def fly_suite(
         require_jobs(order.jobs, here=order.engine == "processes")
     require_disjoint_starts(suite)
     _refuse_no_folder(suite, out, order)
+    if order.engine == SHARED_FOLDER:
+        _refuse_unshared(given, order)
     failed = _refuse_bad_units(suite, given)
     folder = None if out is None else Path(out).absolute()
     with nullcontext() if folder is None else locked(folder):
@@ -104,12 +108,61 @@ def fly_suite(
 
 def _refuse_no_folder(suite: Suite, out: str | Path | None, order: Order) -> None:
     """Some of what is asked for needs a place."""
+    if order.engine == SHARED_FOLDER and out is None:
+        raise ValueError("engine 'folder' needs the folder: give out")
     if order.save_episodes and out is None:
         raise ValueError("save_episodes needs a folder: give out")
     if training_units(suite) and out is None and order.networks is None:
         raise ValueError(
             f"suite {suite.name!r} trains or tunes policies, which need a folder: give out or networks"
         )
+
+
+def _refuse_unshared(given: Mapping[str, Given], order: Order) -> None:
+    """What cannot be said in a folder does not reach those who work there."""
+    if order.jobs is not None:
+        raise ValueError("engine 'folder' has no jobs: start as many quad-envs worker OUT as you like")
+    if given:
+        raise ValueError(
+            f"policy {next(iter(given))!r} is an object, which does not reach the workers of engine "
+            "'folder': name it as module:factory, or choose another engine"
+        )
+
+
+def join_sweep(folder: str | Path, watcher: Watcher | None = None) -> tuple[int, tuple[str, ...]]:
+    """Take part in a sweep that `run_benchmark(..., engine="folder")` has begun, until nothing is left.
+
+    Args:
+        folder: Its results folder.
+        watcher: Follows what is trained and flown, by whomever.
+
+    Returns:
+        How many units are flown, and what was not to be had.
+
+    Raises:
+        ResultsError: If there is no such sweep, or it was begun with other sources.
+    """
+    home = Path(folder).absolute()
+    if not (home / "config.json").is_file():
+        raise ResultsError(
+            f"no sweep has been begun in {str(folder)!r}: quad-envs benchmark SUITE --engine folder --out "
+            f"{shlex.quote(str(folder))} begins one"
+        )
+    config, suite = read_config(home)
+    if config.get("engine") != SHARED_FOLDER:
+        raise ResultsError(
+            f"the sweep in {str(folder)!r} has engine {config.get('engine')!r}, which no worker joins: go on "
+            "with it with --engine folder"
+        )
+    order = Order(
+        engine=SHARED_FOLDER,
+        save_episodes=bool(config["save_episodes"]),
+        networks=config["networks"],
+        watcher=watcher,
+    )
+    sweep = Sweep(suite, {}, {}, home, order, joins=True)
+    sweep.go()
+    return len(sweep.flown), tuple(sweep.failed.values())
 
 
 def _refuse_bad_units(suite: Suite, given: Mapping[str, Given]) -> dict[int, str]:

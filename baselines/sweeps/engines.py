@@ -47,8 +47,10 @@ def check_engine(engine: str) -> None:
     Raises:
         ValueError: If not; it says how to install it.
     """
+    if engine == SHARED_FOLDER:
+        return
     if engine not in ENGINES:
-        raise ValueError(unknown_name("engine", engine, list(ENGINES)))
+        raise ValueError(unknown_name("engine", engine, [*ENGINES, SHARED_FOLDER]))
     package, install = ENGINES[engine][1:]
     if package and find_spec(package) is None:
         raise ValueError(f"engine {engine!r} needs the package {package}: {install}")
@@ -70,7 +72,7 @@ def run_units(
     """
     if engine == "processes" and ((jobs or 1) == 1 or len(units) < 2):
         for unit in units:  # the only one fails as it is: there is nothing to go on with
-            result = work(unit) if len(units) == 1 else _tried(work, unit)
+            result = work(unit) if len(units) == 1 else tried(work, unit)
             yield unit.number, result  # type: ignore[attr-defined]
         return
     if not units:  # a cluster need not be joined
@@ -102,14 +104,14 @@ def _run_elsewhere(submit: Submit, units: Sequence[Unit], limit: int) -> Iterato
                 yield unit.number, future.result()
             except ResultsError:
                 raise
-            except Exception as error:  # of the engine: `_tried` answers for what the unit does
+            except Exception as error:  # of the engine: `tried` answers for what the unit does
                 if not alone:
                     suspects.append(unit)
                 else:
                     yield unit.number, {"failure": f"its process ended without an answer ({_said(error)})"}
 
 
-def _tried(work: Callable[[Any], dict[str, Any]], unit: Any) -> dict[str, Any]:
+def tried(work: Callable[[Any], dict[str, Any]], unit: Any) -> dict[str, Any]:
     """The result of a unit, at the second try if need be, or what went wrong."""
     for attempt in (1, 2):
         try:
@@ -133,7 +135,7 @@ def _said(error: BaseException) -> str:
 
 
 def _found_again(path: list[str], source: str, work: Callable[[Any], Any], payload: bytes) -> dict[str, Any]:
-    """`_tried` in a process that may have begun before the user's modules could be found.
+    """`tried` in a process that may have begun before the user's modules could be found.
 
     Raises:
         ResultsError: If the process has other sources than the sweep: their numbers do not mix.
@@ -145,7 +147,7 @@ def _found_again(path: list[str], source: str, work: Callable[[Any], Any], paylo
             "version of quad-envs on every machine"
         )
     with _ONE_AT_A_TIME:
-        return _tried(work, pickle.loads(payload))
+        return tried(work, pickle.loads(payload))
 
 
 @contextmanager
@@ -215,3 +217,4 @@ ENGINES = {
     "ray": Engine(_ray, "ray", install_command("ray")),
     "dask": Engine(_dask, "distributed", install_command("dask")),
 }
+SHARED_FOLDER = "folder"  # no engine: see `shared`

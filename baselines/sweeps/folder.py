@@ -133,6 +133,25 @@ def read_run(folder: Path) -> Run:
     Raises:
         ResultsError: If there is none, nothing in it is finished, or another version has written it.
     """
+    config, suite = read_config(folder)
+    units = suite_units(suite, suite.episodes)
+    stored = [(unit, [cell.path for cell in cells_of(folder, unit)]) for unit in units]
+    read = (_finished(unit, paths, folder / EPISODES) for unit, paths in stored if paths)
+    finished = tuple(one for one in read if one.evaluation.flights == suite.episodes)  # others are under way
+    if not finished:
+        raise ResultsError(
+            f"nothing in {str(folder)!r} is finished yet; run the same command again: it "
+            "goes on where it stopped"
+        )
+    return Run(folder, config, suite, finished, len(units), _failures(folder))
+
+
+def read_config(folder: Path) -> tuple[dict[str, Any], Suite]:
+    """What config.json of a results folder says, and the suite in it.
+
+    Raises:
+        ResultsError: If there is none, or another version has written it.
+    """
     if not (folder / "config.json").is_file():
         what = "is not a results folder: it has no config.json" if folder.is_dir() else "does not exist"
         raise ResultsError(
@@ -146,16 +165,7 @@ def read_run(folder: Path) -> Run:
     except (KeyError, TypeError, ValueError) as error:
         raise ResultsError(f"the suite in {str(folder / 'config.json')!r} is not valid: {error}") from error
     check_stored(folder, config, suite)
-    units = suite_units(suite, suite.episodes)
-    stored = [(unit, [cell.path for cell in cells_of(folder, unit)]) for unit in units]
-    read = (_finished(unit, paths, folder / EPISODES) for unit, paths in stored if paths)
-    finished = tuple(one for one in read if one.evaluation.flights == suite.episodes)  # others are under way
-    if not finished:
-        raise ResultsError(
-            f"nothing in {str(folder)!r} is finished yet; run the same command again: it "
-            "goes on where it stopped"
-        )
-    return Run(folder, config, suite, finished, len(units), _failures(folder))
+    return config, suite
 
 
 def _failures(folder: Path) -> tuple[str, ...]:

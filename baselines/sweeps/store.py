@@ -20,6 +20,7 @@ from ..files import (
 )
 from .inputs import digest_of, read_files, repeatable
 from .protocol import protocol_facts, refuse_other_version
+from .shared import CLAIMS
 from .suite import Suite
 from .units import Unit
 
@@ -42,7 +43,7 @@ class Cell(NamedTuple):
         return cls(path, digest, range(int(first), int(first) + int(count)))
 
 
-class Block(NamedTuple):
+class Stored(NamedTuple):
     """What a cell holds."""
 
     found: Evaluation
@@ -50,7 +51,7 @@ class Block(NamedTuple):
     flights_saved: int  # the first ones
 
 
-def read_cell(path: Path) -> Block:
+def read_cell(path: Path) -> Stored:
     """Read a cell.
 
     Raises:
@@ -58,7 +59,7 @@ def read_cell(path: Path) -> Block:
     """
     cell = read_json(path)
     try:
-        return Block(Evaluation.from_plain(cell["found"]), dict(cell["task"]), int(cell["flights_saved"]))
+        return Stored(Evaluation.from_plain(cell["found"]), dict(cell["task"]), int(cell["flights_saved"]))
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ResultsError(
             f"{str(path)!r} is not a finished unit ({error!r}); delete it to fly this unit again"
@@ -83,16 +84,20 @@ class Store:
         folder: The results folder, which is begun if it is empty; None to keep nothing.
         suite: Whose results it holds. More or fewer flights are no other suite.
         all_flights: Whether a block counts only if each of its flights was saved.
+        about: What config.json says besides. None: another process has begun the sweep, and this one joins,
+            which deletes nothing.
 
     Raises:
         ResultsError: If the folder holds something else, or was begun with other sources or versions.
     """
 
-    def __init__(self, folder: Path | None, suite: Suite, all_flights: bool) -> None:
-        self.folder, self._all_flights = folder, all_flights
+    def __init__(
+        self, folder: Path | None, suite: Suite, all_flights: bool, about: Mapping[str, Any] | None
+    ) -> None:
+        self.folder, self._all_flights, self._joins = folder, all_flights, about is None
         self._digests: dict[int, str] = {}  # by the number of the unit
         if folder is not None:
-            _begin(folder, suite)
+            _begin(folder, suite, about)
 
     def found(self, unit: Unit) -> list[Evaluation]:
         """The stored blocks of a unit; those that no longer stand for it are deleted."""
@@ -103,13 +108,16 @@ class Store:
         kept, changed = [], False
         for cell in cells_of(self.folder, unit):
             changed |= cell.digest != digest
-            if not repeatable(unit) or cell.digest != digest or not self._complete(unit, cell):
+            good = (repeatable(unit) or self._joins) and cell.digest == digest
+            if not good or not self._complete(unit, cell):
+                if self._joins:
+                    continue
                 cell.path.unlink()
                 for seed in cell.starts:
                     (self.folder / EPISODES / unit.episode_name(seed)).unlink(missing_ok=True)
             else:
                 kept.append(read_cell(cell.path).found)
-        if changed:
+        if changed and not self._joins:
             what = ", ".join(files) or "files that are gone"
             text = (
                 f"{unit.policy.title!r} flies again in {unit.env.title!r}: what it reads has changed ({what})"
@@ -129,8 +137,25 @@ class Store:
             return
         for name, content in flown["flights"].items():
             write_atomic(self.folder / EPISODES / name, content)
-        name = f"{unit.name}-{self._digests[unit.number]}-{block.seed}-{block.episodes}.json"
-        write_json(self.folder / CELLS / name, flown["cell"])
+        write_json(self.folder / CELLS / f"{self.name_of(unit, block)}.json", flown["cell"])
+
+    def name_of(self, unit: Unit, block: Unit) -> str:
+        """Name of the cell of a block."""
+        return f"{unit.name}-{self._digests[unit.number]}-{block.seed}-{block.episodes}"
+
+    def fail(self, unit: Unit, block: Unit, why: str) -> None:
+        """Say to others at this folder that a block is not to be had."""
+        assert self.folder is not None
+        write_json(self.folder / CELLS / f"{self.name_of(unit, block)}.failed", why)
+
+    def outcome(self, unit: Unit, block: Unit) -> Evaluation | str | None:
+        """What has become of a block, by whomever: its flights, why it failed, or None."""
+        assert self.folder is not None
+        path = self.folder / CELLS / f"{self.name_of(unit, block)}.json"
+        if path.exists():
+            return read_cell(path).found
+        failed = path.with_suffix(".failed")
+        return str(read_json(failed)) if failed.exists() else None
 
 
 def blocks_left(unit: Unit, stored: Sequence[Evaluation]) -> Iterator[Unit]:
@@ -146,8 +171,8 @@ def blocks_left(unit: Unit, stored: Sequence[Evaluation]) -> Iterator[Unit]:
         del left[:count]
 
 
-def _begin(folder: Path, suite: Suite) -> None:
-    """Write config.json, after a check that what is there is this suite's."""
+def _begin(folder: Path, suite: Suite, about: Mapping[str, Any] | None) -> None:
+    """Check that what is there is this suite's; who does not join writes config.json."""
     refuse_foreign(folder)
     config, asked = folder / "config.json", plain_json(suite.to_dict())
     now, facts = provenance(), protocol_facts(suite)
@@ -155,8 +180,11 @@ def _begin(folder: Path, suite: Suite) -> None:
         stored = read_json(config)
         refuse_other_version(folder, stored, suite)
         _refuse_other(folder, stored, asked, now)
-    said = {"format": RESULTS_FORMAT, "suite": asked}
-    write_json(config, {**said, **({"protocol": facts} if facts else {}), **now})
+    if about is not None:
+        for path in (*folder.glob(f"{CELLS}/*.failed"), *folder.glob(f"{CLAIMS}/*.json")):
+            path.unlink()  # of an earlier run: what failed is tried again
+        said = {"format": RESULTS_FORMAT, "suite": asked, **about}
+        write_json(config, {**said, **({"protocol": facts} if facts else {}), **now})
 
 
 def _refuse_other(

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 from ..errors import PolicyError
 from ..evaluation.evaluate import Evaluation
-from ..files import FAILURES, discard, locked, write_atomic, write_csv, write_json
+from ..files import FAILURES, discard, write_csv, write_json
 from .comparison import Failure, Results
-from .engines import run_units
-from .finished import begun, train_elsewhere, train_unit
-from .inputs import read_files
-from .stages import price
+from .crews import Block, crew_of
 from .store import Store, blocks_left
 from .suite import Suite
-from .unit_flights import fly_unit, timed_unit
 from .units import Given, TrainingUnit, Unit, suite_units, training_units
 
 REPORTED = 2  # flights of each unit that are saved for the report where not all are asked for
@@ -44,7 +40,9 @@ class Watcher(Protocol):
 class Order:
     """How a suite is to be flown; the comment of a field is its documentation everywhere."""
 
-    engine: str = "processes"  # or "ray" or "dask"
+    engine: str = (
+        "processes"  # or "ray" or "dask", or "folder": everybody who calls `quad-envs worker OUT` takes part
+    )
     jobs: int | None = None  # units flown at a time; one here, all that a cluster has, if not given
     save_episodes: bool = (
         False  # whether to write every flight to out/episodes, and not only the first REPORTED of each unit,
@@ -76,6 +74,8 @@ class Sweep:
         failed: dict[int, str],
         folder: Path | None,
         order: Order,
+        *,
+        joins: bool = False,  # a sweep that another process has begun
     ) -> None:
         self.suite, self.failed, self.folder, self.order = suite, failed, folder, order
         home = Path(order.networks or (folder or Path()) / "networks").absolute()
@@ -84,7 +84,9 @@ class Sweep:
         self.units = with_given(suite_units(suite, saved, home), given)
         if folder is not None and order.fresh:
             discard(folder)
-        self.store = Store(folder, suite, order.save_episodes)
+        about = {"save_episodes": order.save_episodes, "networks": str(home), "engine": order.engine}
+        self.store = Store(folder, suite, order.save_episodes, None if joins else about)
+        self.crew = crew_of(order.engine, order.jobs, self.store)
         self.parts: dict[int, list[Evaluation]] = {}  # blocks that are flown, by the number of their unit
         self.flown: dict[int, Evaluation] = {}  # whole units
         self.trained: dict[int, dict[str, Any]] = {}
@@ -95,38 +97,27 @@ class Sweep:
         for number in self.failed:
             self._warn(number)
         self._train()
-        blocks = self._left()
+        blocks = self.crew.order(self._left())
         self._report()
-        watcher, engine, jobs = self.order.watcher, self.order.engine, self.order.jobs
-        alone = engine == "processes" and (jobs or 1) == 1
-        if alone:  # in parallel the long ones would be left over in the end
-            places = {block.env.title: i for i, (_, block) in reversed(list(enumerate(blocks)))}
-            blocks.sort(key=lambda one: (places[one[1].env.title], price(one[1])))
+        watcher = self.order.watcher
         if watcher is not None:
-            watcher.ready([block for _, block in blocks])
-        if not alone:  # before others take the cores
-            blocks = [(unit, timed_unit(block) if block.timed is None else block) for unit, block in blocks]
-        if engine != "processes":
-            blocks = [(unit, block._replace(files=read_files(block))) for unit, block in blocks]
-        numbered = [block._replace(number=i) for i, (_, block) in enumerate(blocks)]
-        for i, flown in run_units(fly_unit, numbered, engine, jobs):
-            unit, block = blocks[i]
-            if "failure" in flown:
-                self._fail(unit.number, flown["failure"])
+            watcher.ready([block.part for block in blocks])
+        for block, found in self.crew.flights(blocks):
+            if isinstance(found, str):
+                self._fail(block.unit.number, found)
             else:
-                self.store.keep(unit, block, flown)
-                self._add(unit, Evaluation.from_plain(flown["cell"]["found"]))
+                self._add(block.unit, found)
             self._report()
             if watcher is not None:
-                watcher.moved(block)
-                if unit.number in self.flown:
-                    watcher.flown(unit, self.flown[unit.number])
+                watcher.moved(block.part)
+                if block.unit.number in self.flown:
+                    watcher.flown(block.unit, self.flown[block.unit.number])
 
     def _train(self) -> None:
         watcher, count = self.order.watcher, len(self.to_train)
         if watcher is not None and self.to_train:
             watcher.trained(0, count)
-        for number, training in self._trainings():
+        for number, training in self.crew.trainings(self.to_train):
             if "failure" in training:
                 self._lose(self.to_train[number], training["failure"])
                 continue
@@ -135,33 +126,15 @@ class Sweep:
             if watcher is not None:
                 watcher.trained(len(self.trained), count)
 
-    def _trainings(self) -> Iterator[tuple[int, dict[str, Any]]]:
-        """Networks as they are there; those of a cluster come with all their files."""
-        engine, jobs = self.order.engine, self.order.jobs
-        if engine == "processes":
-            yield from run_units(train_unit, self.to_train, engine, jobs)
-            return
-        here = [unit for unit in self.to_train if begun(unit)]
-        yield from run_units(train_unit, here, "processes", 1)
-        away = [unit for unit in self.to_train if unit not in here]
-        for number, done in run_units(train_elsewhere, away, engine, jobs):
-            if "failure" in done:
-                yield number, done
-                continue
-            with locked(self.to_train[number].folder):
-                for name, content in done["files"].items():
-                    write_atomic(self.to_train[number].folder / name, content)
-            yield number, done["training"]
-
-    def _left(self) -> list[tuple[Unit, Unit]]:
-        """Units, and blocks of their flights that are not stored."""
+    def _left(self) -> list[Block]:
+        """Blocks of flights that are not stored."""
         left = []
         for unit in self.units:
             if unit.number not in self.failed:
                 stored = self.store.found(unit)
                 for part in stored:
                     self._add(unit, part)
-                left += [(unit, block) for block in blocks_left(unit, stored)]
+                left += [Block(unit, part) for part in blocks_left(unit, stored)]
         return left
 
     def _add(self, unit: Unit, part: Evaluation) -> None:
