@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from stub_training import stubs  # noqa: F401
 
-import baselines.sweeps.sweep
+import baselines.sweeps.crews
 from baselines import ResultsError, load_suite, run_benchmark
 from baselines.policies.environments import make_env
 from baselines.sweeps.budget import budget_of
@@ -219,9 +219,9 @@ def test_an_interrupted_protocol_goes_on_with_what_it_made(tmp_path, finished, m
         run_benchmark(SMALL, tmp_path / "cut", on_unit=interrupt)
     made = sorted(path.parent.name for path in (tmp_path / "cut").rglob("tuned.json"))
     assert len(made) == 1 and not (tmp_path / "cut" / "results.csv").exists()
-    calls, real = [], baselines.sweeps.sweep.train_unit
+    calls, real = [], baselines.sweeps.crews.train_unit
     monkeypatch.setattr(
-        baselines.sweeps.sweep, "train_unit", lambda unit: calls.append(unit.policy.title) or real(unit)
+        baselines.sweeps.crews, "train_unit", lambda unit: calls.append(unit.policy.title) or real(unit)
     )
     results = run_benchmark(SMALL, tmp_path / "cut")
     assert len(calls) == 4
