@@ -8,6 +8,7 @@ report.html        the leaderboard and these flights to look at, see `baselines.
 results.csv        one row per environment x policy x flight (x vehicle), when all units are finished
 summary.csv        one row per environment x policy
 failures.json      policies that could not be made or broke off, where, and why
+frontier-*.svg     score against quadratic cost, where the suite traces the family of an MPC
 contenders.csv     one row per table x environment x contender, where policies have seeds: all of them are one
 claims/            who is at what, where several processes share the folder
 networks/          folders of networks, see training/run_folder.py, and of tuned controllers
@@ -46,6 +47,7 @@ _RESULTS = (
     FAILURES,
     "report.html",
     "replay.html",
+    "frontier-*.svg",
     "cells/*.json",
     "cells/*.failed",
     "claims/*",

@@ -242,7 +242,7 @@ def test_the_frontier_shows_the_family_of_an_mpc_and_who_is_near_it(show, folder
     page.locator("#environments button", has_text="HelixTracking").click()
     assert page.locator(".frontier .step").count() == 2 and page.locator(".frontier .point").count() == 2
     assert page.locator(".frontier .name").all_text_contents() == ["ppo", "lqr"]
-    assert "lost" in page.locator("#frontier .legend").inner_text()
+    assert "lost" in page.locator("#frontier-note").inner_text()
     assert page.locator("#board tbody tr").count() == 3  # points of the family stand in the picture alone
 
 

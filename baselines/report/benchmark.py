@@ -29,7 +29,8 @@ from ..sweeps.suite import Suite
 from ..sweeps.suite_files import load_suite
 from ..sweeps.sweep import Order, Sweep, Watcher, with_given
 from ..sweeps.units import Given, Unit, suite_units, training_units
-from .build import render_report
+from .build import build_report, frontier_files
+from .page import render_page
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +103,10 @@ def fly_suite(
         sweep.go()
         results = sweep.finish()
         if folder is not None:
-            write_atomic(folder / "report.html", render_report(read_run(folder)).encode())
+            report = build_report(read_run(folder))
+            write_atomic(folder / "report.html", render_page(report).encode())
+            for name, picture in frontier_files(report).items():
+                write_atomic(folder / name, picture.encode())
         return results
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from ..sweeps.choices import TableChoice
 from ..sweeps.folder import Finished, Flown, Run, read_contenders
 from ..sweeps.protocol import protocol_facts
 from .answer import answer
+from .frontier import as_file
 from .leaderboard import contender_board, leaderboard
 from .model import PAGE_FORMAT, Answer, Board, Environment, Report
 from .page import render_page
@@ -128,6 +130,17 @@ def _to_show(here: Sequence[Finished]) -> list[Finished]:
         if not one.unit.policy.trace:
             first.setdefault(one.unit.policy.contender, one)
     return list(first.values())
+
+
+def frontier_files(report: Report) -> dict[str, str]:
+    """Name of a file -> picture of the frontier, one per environment and table that has one."""
+    out = {}
+    for env in report.environments:
+        for board in env.boards:
+            if board.frontier.svg:
+                words = re.sub(r"[^a-z0-9]+", "-", f"{env.title} {board.title}".lower()).strip("-")
+                out[f"frontier-{words}.svg"] = as_file(board.frontier.svg)
+    return out
 
 
 def _starts(here: Sequence[Finished]) -> list[int]:

@@ -10,7 +10,8 @@ from ..evaluation import column as evaluation
 from ..evaluation.column import COMPARED, COUNTED, PERCENT, UNSEEN
 from ..evaluation.columns import COLUMNS, fallbacks, limits_in, shown
 from ..sweeps.contenders import SCORES, SEEDS, TRAININGS
-from .model import Board, Column, Point, Row
+from .frontier import Point, Spread, draw_frontier
+from .model import Board, Column, Row
 
 # What answers the question, in this order: the first that an environment has stand in the first table.
 _MAIN = (
@@ -116,10 +117,10 @@ def contender_board(every: Sequence[Mapping[str, str]], title: str = "", about: 
         out.append(Row(_titled(row), False, cells))
     kept = _with_main([c for c in columns if any(row.cells[c.key][0] is not None for row in out)])
     titles = [one.policy for row, one in zip(rows, out, strict=True) if row["policy"] == base]
-    frontier = tuple(_point(row) for row in here)
     names = {row["policy"]: _titled(row) for row in rows}
     board = Board(title, about, titles[0] if titles else base, tuple(kept), tuple(out), names)
-    return board._replace(frontier=frontier if any(point.trace for point in frontier) else ())
+    places = {row["policy"]: k for k, row in enumerate(rows)}
+    return board._replace(frontier=draw_frontier([_point(row, places.get(row["policy"], 0)) for row in here]))
 
 
 def _titled(row: Mapping[str, str]) -> str:
@@ -132,13 +133,13 @@ def _half(low: float | None, high: float | None) -> float | None:
     return None if low is None or high is None else 0.5 * (high - low)
 
 
-def _point(row: Mapping[str, str]) -> Point:
+def _point(row: Mapping[str, str], colour: int) -> Point:
     """A contender in the plane of score and cost."""
     score, cost = (
-        tuple(_text_number(row.get(name + end)) for end in ("", "_low", "_high"))
+        Spread(*(float(row.get(name + end) or "nan") for end in ("", "_low", "_high")))
         for name in ("score", "quadratic_cost")
     )
-    return Point(row["policy"], row["kind"], row.get("trace", ""), score, cost)
+    return Point(row["policy"], row.get("trace", ""), colour, score, cost)
 
 
 def _text_number(text: str | None) -> float | None:

@@ -80,21 +80,18 @@ class Row(NamedTuple):
     cells: dict[str, tuple[float | None, ...]]  # column -> mean, half width; or value, low, high
 
 
+class Frontier(NamedTuple):
+    """A picture of score against quadratic cost, and who has no place in it; empty where there is none."""
+
+    svg: str = ""
+    note: str = ""
+
+
 class Answer(NamedTuple):
     """Who wins, by how much, and who is as good."""
 
     sentence: str = ""
     pair: tuple[str, ...] = ()  # the winner, and the best of those that are told apart from it
-
-
-class Point(NamedTuple):
-    """A contender in the plane of score and quadratic cost; each with the ends of its interval, or None."""
-
-    name: str
-    kind: str
-    trace: str  # line on which it lies, "" for none
-    score: tuple[float | None, ...]  # value, low, high
-    cost: tuple[float | None, ...]
 
 
 class Board(NamedTuple):
@@ -106,7 +103,7 @@ class Board(NamedTuple):
     columns: tuple[Column, ...]
     rows: tuple[Row, ...]
     names: dict[str, str]  # contender -> its row; afterwards policy whose flights are shown -> row
-    frontier: tuple[Point, ...] = ()
+    frontier: Frontier = Frontier()
     answer: Answer = Answer()
 
 

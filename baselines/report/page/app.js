@@ -117,8 +117,7 @@ function showTables(environment, title, opened) {
   byId("board").replaceChildren(drawBoard(shown, shown.columns.filter((column) => column.main)));
   byId("board-more").replaceChildren(drawBoard(shown));
   byId("more").hidden = shown.columns.every((column) => column.main);
-  byId("frontier").hidden = !board?.frontier.length;
-  if (board?.frontier.length) byId("frontier-picture").replaceChildren(drawFrontier(board));
+  showFrontier(board);
   byId("policies").hidden = !board;
   byId("policies-board").replaceChildren(...(board ? [drawBoard(environment)] : []));
   const flights = report.run.episodes;
