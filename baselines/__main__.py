@@ -81,7 +81,7 @@ def _export(options: ExportOptions) -> int:
 def _reproduce(options: ReproduceOptions) -> int:
     from . import reproduction as reproduce
 
-    return int(reproduce.run(options.what, options.out, options.json, options.jobs))
+    return int(reproduce.run(options.what, options.out, options.json, options.jobs, options.fresh))
 
 
 def _report(options: ReportOptions) -> int:

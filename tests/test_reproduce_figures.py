@@ -220,7 +220,14 @@ def test_an_interrupt_leaves_finished_figures_whole_and_a_page_that_says_so(tmp_
     with pytest.raises(KeyboardInterrupt):
         run(["figures-4"], tmp_path, False, 1)
     found = {path.name for path in tmp_path.rglob("*") if path.is_file()}
-    assert found == {"figure-4-13.png", "figure-4-13.pdf", page.NAME, "reproduce.json"}
+    assert found == {
+        "figure-4-13.png",
+        "figure-4-13.pdf",
+        page.NAME,
+        "reproduce.json",
+        "config.json",
+        ".lock",
+    }
     assert "interrupted: figures-4" in (tmp_path / page.NAME).read_text()
 
 

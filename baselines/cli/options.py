@@ -161,7 +161,8 @@ class ReproduceOptions:
     )
     jobs: Annotated[int, "processes"] = 1
     json: Annotated[bool, "print JSON"] = False
-    out: Annotated[Path | None, "results folder"] = None
+    out: Annotated[Path | None, "folder; sections that are there are read, and not flown again"] = None
+    fresh: Annotated[bool, "discard the sections that the folder holds"] = False
 
 
 @dataclass(frozen=True, slots=True)

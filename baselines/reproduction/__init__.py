@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 from quad_envs.names import unknown_name
 
 from ..evaluation.amounts import require_jobs
-from ..files import write_atomic
+from ..files import locked
 from ..report.figures import house_style
 from ..sweeps.progress import Progress, said_seconds
 from . import estimation_claims, estimation_tables, formation_claims, formation_tables, page, target_claims
 from .identification import identification
 from .regulation_claims import REGULATION_CLAIMS
 from .results import Section
+from .store import Store
+from .store import as_json as written
 from .tables import table_4_1, table_4_2
 from .tracking_claims import TRACKING_CLAIMS
 
@@ -134,29 +136,49 @@ def reproduce(what: Sequence[str] = (), jobs: int = 1, out: Path | None = None) 
     return list(sections(what, jobs, out))
 
 
-def run(what: list[str], out: Path | None, as_json: bool, jobs: int) -> int:
-    """The command: print the sections, and write them to `out` where given.
+def run(what: list[str], out: Path | None, as_json: bool, jobs: int, fresh: bool = False) -> int:
+    """The command: print the sections, and keep them in `out` where given.
 
-    After each section `out`/reproduce.json and the page `out`/reproduction.html are written anew: what is
-    finished is there whenever the run ends.
+    A section that is in `out` is read and not flown again, and what is there besides stays. After each
+    section `out`/reproduce.json and the page `out`/reproduction.html are written anew: what is finished is
+    there whenever the run ends.
+
+    Raises:
+        ValueError: As `sections` says, or if `fresh` is asked for without a folder.
+        ResultsError: If `out` is in use, holds something else, or cannot be written.
     """
-    asked, names = sections(what, jobs, out), section_names(what, out is not None)
-    found: list[Section] = []
-    if out is not None:
-        _write(
-            found, names, out
-        )  # now, so that a folder that cannot be written ends the run before its flights
-    for section in _followed(asked, names, quiet=as_json):
-        found.append(section)
-        if out is not None:
-            _write(found, names, out)
+    if fresh and out is None:
+        raise ValueError("--fresh needs a folder: --out DIR")
+    sections(what, jobs, out)  # which refuses what cannot be done
+    names = section_names(what, out is not None)
+    with nullcontext() if out is None else locked(out):
+        store = None if out is None else Store(out, ORDER, fresh)
+        found = _run(names, store, jobs, as_json)
     if as_json:
-        sys.stdout.write(_as_json(found))
+        sys.stdout.write(written(found))
     elif out is not None:
         print(f"{out / page.NAME} has it all on one page")
     elif not what or "all" in what:
         print("Figures and the page are made with --out DIR.")
     return 0
+
+
+def _run(names: list[str], store: Store | None, jobs: int, quiet: bool) -> list[Section]:
+    """Read or make the sections, and keep them."""
+    found = {name: section for name in names if store and (section := store.read(name)) is not None}
+    left = [name for name in names if name not in found]
+    if store is not None:
+        store.publish(left)  # now, so that a folder that cannot be written ends the run before its flights
+    for section in found.values():
+        if not quiet:
+            print(f"{section}\n")
+    out = None if store is None else store.folder
+    for section in _followed((_section(name, jobs, out) for name in left), left, quiet):
+        found[section.name] = section
+        if store is not None:
+            store.keep(section)
+            store.publish([name for name in names if name not in found])
+    return [found[name] for name in names]
 
 
 def _followed(asked: Iterator[Section], names: list[str], quiet: bool) -> Iterator[Section]:
@@ -176,12 +198,3 @@ def _followed(asked: Iterator[Section], names: list[str], quiet: bool) -> Iterat
             yield section
     finally:
         progress.close()
-
-
-def _as_json(found: list[Section]) -> str:
-    return json.dumps({"sections": [section.to_dict() for section in found]}, indent=2) + "\n"
-
-
-def _write(found: list[Section], names: list[str], out: Path) -> None:
-    write_atomic(out / "reproduce.json", _as_json(found).encode())
-    write_atomic(out / page.NAME, page.render(found, out, names[len(found) :]).encode())
