@@ -68,9 +68,7 @@ class PolicyGradientOptions:
 class DaggerOptions:
     """Hyperparameters of DAgger."""
 
-    expert: str = (
-        ""  # a policy, or a trained one; sdc-nmpc for one vehicle, consensus- or cooperative-mpc for teams
-    )
+    expert: str = ""  # a policy, or a trained one; empty: sdc-nmpc, consensus-mpc or cooperative-mpc
     n_envs: int = 64  # flights at once, or vehicles of all teams
     n_steps: int = 20  # of each of them between fits
     expert_flies: float = 0.2  # share of the budget in which those that the expert flies fall to none

@@ -18,7 +18,7 @@ from quad_envs.names import unknown_name
 from quad_envs.registration import ENTRY, TEAMS, TRACKING, VECTOR_ENTRY
 
 from ..evaluation.columns import renamed
-from ..evaluation.evaluate import fly_and_measure
+from ..evaluation.evaluate import Evaluation, fly_and_measure
 from ..policies.network import Network
 from ..policies.network_policies import network_policy
 from ..policies.outside import import_named
@@ -123,6 +123,10 @@ class HeldOutFlights:
         policy = network_policy(network, self.task, "training")
         return self.judge_policy(policy, cpu_seconds, progress, seed)
 
+    def fly(self, policy: Policy, seed: int) -> Evaluation:
+        """Fly a policy from the starts of these seeds, the first of which is given."""
+        return fly_and_measure(policy, self.env, self.flights, seed)
+
     def judge_policy(
         self, policy: Policy, cpu_seconds: float, progress: Progress, seed: int = CHOOSING
     ) -> Point:
@@ -134,7 +138,7 @@ class HeldOutFlights:
             progress: Of its training.
             seed: Environment seed of the first flight.
         """
-        found = fly_and_measure(policy, self.env, self.flights, seed)
+        found = self.fly(policy, seed)
         summary = found.summary()
         return Point(
             cpu_seconds=cpu_seconds,
