@@ -29,6 +29,7 @@ from .network import Network
 FORMAT = 4  # rises when an older suite could not read a checkpoint
 _OLDEST = 1  # that this version reads
 WEIGHTS, DESCRIPTION = "network.safetensors", "policy.json"
+_BROUGHT = "policy"  # metadata of the weights that are the description
 _LARGEST = 50_000_000  # bytes; the networks here are a thousandth of it
 _PACKAGES = ("quad-envs", "numpy", "gymnasium", "torch", "stable-baselines3")
 
@@ -79,8 +80,10 @@ def save_checkpoint(folder: str | Path, network: Network, about: Mapping[str, An
         "versions": versions(),
         **about,
     }
-    # The description carries the digest of its weights: a pair that does not belong together is refused.
-    data = save(tensors, metadata={"format": str(described["format"])})
+    # The weights bring their description along, and the file beside them has their digest: where a writer
+    # died between the two, what the weights bring is right.
+    text = json.dumps(described)
+    data = save(tensors, metadata={"format": str(described["format"]), _BROUGHT: text})
     described["digest"] = _digest(data)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -111,13 +114,7 @@ def load_checkpoint(folder: str | Path) -> tuple[Network, dict[str, Any]]:
     """
     path = Path(folder)
     where = f"checkpoint {str(path)!r}"
-    described = _read_description(path, where)
-    data = _read(path / WEIGHTS, where)
-    tensors = _read_tensors(data, where)
-    if described.get("digest") != _digest(data):
-        raise CheckpointError(
-            f"{where}: {DESCRIPTION} describes other weights than {WEIGHTS} holds; train again"
-        )
+    described, tensors = _read_pair(path, where)
     try:
         features = described["features"]
         network = Network(
@@ -138,6 +135,36 @@ def load_checkpoint(folder: str | Path) -> tuple[Network, dict[str, Any]]:
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise CheckpointError(f"{where} is not a valid network: {error}") from error
     return network, described
+
+
+def _read_pair(path: Path, where: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The description, and the weights by name."""
+    if not os.path.lexists(path / DESCRIPTION) and (path / WEIGHTS).exists():
+        data = _read(path / WEIGHTS, where)
+        described = _brought(data, where)
+    else:
+        described = _checked(_read(path / DESCRIPTION, where), where, DESCRIPTION)
+        data = _read(path / WEIGHTS, where)
+    tensors = _read_tensors(data, where)
+    if described is None:
+        raise CheckpointError(f"{where}: there is no {DESCRIPTION} beside {WEIGHTS}; train again")
+    if described.get("digest") != _digest(data):
+        described = _brought(data, where)
+    if described is None:
+        raise CheckpointError(
+            f"{where}: {DESCRIPTION} describes other weights than {WEIGHTS} holds; train again"
+        )
+    return described, tensors
+
+
+def _brought(data: bytes, where: str) -> dict[str, Any] | None:
+    """The description that weights bring along; None if they are of an earlier version, which has none."""
+    try:
+        size = int.from_bytes(data[:8], "little")
+        text = json.loads(data[8 : 8 + size])["__metadata__"][_BROUGHT]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return _checked(text, where, WEIGHTS) | {"digest": _digest(data)}
 
 
 def _format_of(network: Network) -> int:
@@ -177,11 +204,12 @@ def _read(file: Path, where: str) -> bytes:
     return data
 
 
-def _read_description(path: Path, where: str) -> dict[str, Any]:
+def _checked(text: str | bytes, where: str, name: str) -> dict[str, Any]:
+    """A description of a format that this version reads."""
     try:
-        described = json.loads(_read(path / DESCRIPTION, where))
+        described = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise CheckpointError(f"{where}: {DESCRIPTION} is not valid JSON: {error}") from error
+        raise CheckpointError(f"{where}: {name} is not valid JSON: {error}") from error
     if not isinstance(described, dict) or described.get("format") not in range(_OLDEST, FORMAT + 1):
         found = described.get("format") if isinstance(described, dict) else described
         raise CheckpointError(

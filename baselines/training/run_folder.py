@@ -17,7 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ..errors import CheckpointError, ResultsError
+from ..errors import ResultsError
 from ..files import plain_json, provenance, read_json, write_atomic, write_csv
 from ..policies.checkpoints import DESCRIPTION, WEIGHTS, load_checkpoint, save_checkpoint
 from ..policies.network import Network
@@ -59,7 +59,7 @@ class RunFolder:
                     f"{str(self.path)!r} holds a {foreign[0]} that no training has written; choose another "
                     "folder, or move it away"
                 )
-        elif not fresh and (self.last.exists() or (self.path / WEIGHTS).exists()):
+        elif not fresh and any((place / WEIGHTS).exists() for place in (self.last, self.path)):
             raise ResultsError(
                 f"{str(self.path)!r} holds a training of {found['algorithm']} on {found['env_id']}, seed "
                 f"{found['seed']}: go on with it (--resume), discard it (--fresh), or choose another folder"
@@ -70,6 +70,18 @@ class RunFolder:
             for name in ("last", "tensorboard"):
                 shutil.rmtree(self.path / name, ignore_errors=True)
         self.write_config([])
+
+    def has_policy(self) -> bool:
+        """Whether there is something to go on from: a run that ended before its first policy begins anew.
+
+        Raises:
+            ResultsError: If there is no run.
+        """
+        if self._config() is None:
+            raise ResultsError(
+                f"{str(self.path)!r} holds no training that could be resumed; leave --resume out"
+            )
+        return (self.last / WEIGHTS).exists()
 
     def read(self) -> tuple[Network, dict[str, Any], list[Point]]:
         """The last network, what policy.json says of it, and the curve so far.
@@ -91,11 +103,6 @@ class RunFolder:
             raise ResultsError(
                 f"{str(self.path)!r} holds another training: its {name} is {json.dumps(found.get(name))}, "
                 f"asked for is {json.dumps(asked.get(name))}; give the same, or choose another folder"
-            )
-        if not self.last.exists():
-            raise CheckpointError(
-                f"the training in {str(self.path)!r} was interrupted before its first policy, so there is "
-                "nothing to go on from: the same command without --resume begins anew"
             )
         network, described = load_checkpoint(self.last)
         return network, described, self.read_curve()

@@ -79,6 +79,8 @@ def run_training(request: TrainingRequest) -> TrainingResult:
     with remembered(), locked(path):
         folder = plan.folder(path)
         if request.resume:
+            require_resumable(plan.algorithm)
+        if request.resume and folder.has_policy():
             start = _resume(folder, plan)
         else:
             folder.begin(request.fresh)
@@ -92,7 +94,6 @@ def run_training(request: TrainingRequest) -> TrainingResult:
 
 def _resume(folder: RunFolder, plan: Plan) -> Start:
     """Where the run in the folder goes on."""
-    require_resumable(plan.algorithm)
     start = read_start(folder)
     if plan.budget.share(start.seconds, start.steps) >= 1.0:
         raise ResultsError(
