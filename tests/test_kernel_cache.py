@@ -149,7 +149,7 @@ def identity(x):
 def file_name(signature=(float64,)):
     """Under which a kernel is kept."""
     processor = cpu_target.target_context.codegen().magic_tuple()
-    return cache.KernelCache(kernel(identity))._file_name(signature, processor)
+    return cache.KernelCache(kernel(identity)).name(signature, processor)
 
 
 @pytest.mark.parametrize(
@@ -245,7 +245,7 @@ def shipped_kernel(tmp_path, monkeypatch):
     compiled = fresh_kernel(made, monkeypatch)
     compiled(1.5)
     processor = (cpu_target.target_context.codegen().magic_tuple()[0], cache.CPU, "")
-    file = shipped / compiled.entry._cache._file_name((float64,), processor)
+    file = shipped / f"{compiled.entry._cache.name((float64,), processor)}.nbc"
     next(made.iterdir()).rename(file)
     monkeypatch.setattr(cache, "SHIPPED", shipped)
     monkeypatch.setattr(cache, "runs_shipped", cache.runs_shipped.__wrapped__)
@@ -368,9 +368,80 @@ def test_a_kernel_that_calls_what_is_not_there_is_compiled_anew(tmp_path, monkey
     packed = file.read_bytes()[cache._HEADER :]
     with pytest.raises(ValueError, match="needs no_such_function"):
         monkeypatch.setattr(kernel_file, "_missing", lambda needed: ["no_such_function"])
-        kernel_file.unpack(packed, cpu_target.target_context)
+        kernel_file.unpack(packed, cpu_target.target_context, load=lambda name: None)
     again = fresh_kernel(tmp_path, monkeypatch)
     assert again(1.5) == 3.0 and sum(again.entry.stats.cache_misses.values()) == 1
+
+
+SHARED = """
+import sys
+import numpy as np
+from quad_envs.compilation.decorators import kernel, separate_kernel
+
+@kernel
+def twice(x):
+    return 2.0 * x
+
+@separate_kernel
+def total(x):
+    if x.size > 3:
+        raise ValueError("at most three")
+    return twice(x).sum()
+
+@kernel
+def first(x):
+    return total(x) + 1.0
+
+@kernel
+def second(x):
+    return total(x) - 1.0
+
+print([{"first": first, "second": second, "total": total}[name](np.ones(3)) for name in sys.argv[1:]])
+try:
+    first(np.ones(4))
+except ValueError as error:
+    print(error)
+print("compiler loaded:", "numba.np.arraymath" in sys.modules)
+"""
+
+
+@pytest.fixture
+def shared(tmp_path):
+    """Runs `SHARED` with names of kernels to call; the folder of their files."""
+    script = tmp_path / "shared.py"
+    script.write_text(SHARED)
+
+    def run(*names):
+        command = [sys.executable, str(script), *names]
+        environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+
+    return run, tmp_path / "quad-envs"
+
+
+def test_a_separate_kernel_is_compiled_once_for_all_that_call_it_in_any_process(shared):
+    run, folder = shared
+    assert run("first") == "[7.0]\nat most three\ncompiler loaded: True\n"
+    (separate,) = folder.glob("__main__.total-*.nbc")
+    made = separate.stat().st_mtime_ns
+    assert run("second", "total").startswith("[5.0, 6.0]\nat most three")
+    assert separate.stat().st_mtime_ns == made
+    assert {path.name.split("-")[0] for path in folder.iterdir()} == {
+        "__main__.first", "__main__.second", "__main__.total"
+    }  # fmt: skip
+    assert run("second", "first") == "[5.0, 7.0]\nat most three\ncompiler loaded: False\n"
+
+
+def test_without_the_file_of_a_separate_kernel_all_that_call_it_are_compiled_anew(shared):
+    run, folder = shared
+    run("first", "second")
+    (separate,) = folder.glob("__main__.total-*.nbc")
+    for damage in (separate.unlink, lambda: separate.write_bytes(b"cut")):
+        damage()
+        assert run("first") == "[7.0]\nat most three\ncompiler loaded: True\n"
+        assert separate.exists()
+        assert run("first", "second").startswith("[7.0, 5.0]")
+        assert run("first", "second").endswith("compiler loaded: False\n")
 
 
 ONE_STEP = """

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from quad_envs.compilation.decorators import kernel
+from quad_envs.compilation.decorators import kernel, separate_kernel
 from quad_envs.parameters import N_INPUT, Array
 
 from .active_set import (
@@ -329,7 +329,7 @@ def _is_optimal(qp: OcpQp, rows: RowData, ws: Workspace) -> bool:
     return bool(_stationarity(qp, rows, ws) <= STATIONARY)
 
 
-@kernel
+@separate_kernel
 def solve_qp(qp: OcpQp, iteration_limit: int, warm: bool, ws: Workspace) -> tuple[int, int]:
     """Solve one OCP-QP, whose R_rate is an array: (0, 4) where changes have no weight.
 

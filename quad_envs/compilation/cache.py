@@ -16,7 +16,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ import numpy as np
 from numba.core import config, types
 
 from .digest import digest
-from .kernel_file import pack, unpack
+from .kernel_file import pack, publish, published, unpack
 from .portable import CPU, NEEDED, SHIPPED
 
 PACKAGES = ("quad_envs", "controllers", "baselines")
@@ -120,7 +120,11 @@ def _is_ours(place: Path) -> bool:
 
 
 class KernelCache:
-    """What numba's dispatcher asks to load and to save the compiled forms of one kernel."""
+    """What numba's dispatcher asks to load and to save the compiled forms of one kernel.
+
+    Args:
+        kernel: The dispatcher.
+    """
 
     def __init__(self, kernel: Any) -> None:
         function, self._kernel = kernel.py_func, kernel
@@ -136,13 +140,13 @@ class KernelCache:
     def load_overload(self, signature: Any, target: Any) -> Any:
         """The compiled form for these argument types, the user's or the wheel's; None if there is none."""
         processor = target.codegen().magic_tuple()
-        name = self._file_name(signature, processor)
-        paths = [place / name for place in folders()]
+        name = self.name(signature, processor)
+        files = [(place, name) for place in folders()]
         if runs_shipped():
-            paths.append(SHIPPED / self._file_name(signature, (processor[0], CPU, "")))
-        for path in paths:
+            files.append((SHIPPED, self.name(signature, (processor[0], CPU, ""))))
+        for place, name in files:
             with contextlib.suppress(FileNotFoundError):
-                compiled = _read(path, target)
+                compiled = published(name) or _read(place / f"{name}.nbc", target)
                 if compiled is not None:
                     return compiled
         return None
@@ -154,18 +158,19 @@ class KernelCache:
             return
         with contextlib.suppress(OSError):
             raw = pack(compiled)
-            path = place / self._file_name(signature, compiled.codegen.magic_tuple())
-            unfinished = place / f"{path.stem}.{os.getpid()}.tmp"
+            name = self.name(signature, compiled.codegen.magic_tuple())
+            unfinished = place / f"{name}.{os.getpid()}.tmp"
             unfinished.write_bytes(hashlib.sha256(raw).digest() + raw)
-            os.replace(unfinished, path)
+            os.replace(unfinished, place / f"{name}.nbc")
             self._sweep(place)
 
-    def _file_name(self, signature: Any, processor: tuple[str, ...]) -> str:
+    def name(self, signature: Any, processor: tuple[str, ...]) -> str:
+        """Of the file, without its suffix, for these argument types."""
         if self._digest is None:
             self._digest = digest(self._kernel)[:16]
         made_for = (_describe_signature(signature), _versions(), _settings(), processor)
         key = hashlib.sha256(repr(made_for).encode()).hexdigest()[:16]
-        return f"{self._name}-{self._digest}-{key}.nbc"
+        return f"{self._name}-{self._digest}-{key}"
 
     def _sweep(self, place: Path) -> None:
         """Delete what older versions of this kernel, and writers that died, left a while ago."""
@@ -196,10 +201,20 @@ def _read(path: Path, target: Any) -> Any:
         raw = path.read_bytes()
         if hashlib.sha256(raw[_HEADER:]).digest() != raw[:_HEADER]:
             raise ValueError("cut or changed")
-        return unpack(raw[_HEADER:], target)
+        return unpack(raw[_HEADER:], target, partial(_load_separate, target))
     except FileNotFoundError:
         raise
     except Exception:  # whatever is wrong with it, compiling is the remedy
         with contextlib.suppress(OSError):
             path.unlink()
         return None
+
+
+def _load_separate(target: Any, name: str) -> None:
+    """Publish the separate kernel of that name, if there is a file of it."""
+    for place in (*folders(), SHIPPED):
+        with contextlib.suppress(FileNotFoundError):
+            compiled = _read(place / f"{name}.nbc", target)
+            if compiled is not None:
+                publish(compiled)
+                return

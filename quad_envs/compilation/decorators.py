@@ -22,6 +22,7 @@ from numba.core import config, event
 try:
     from .cache import PACKAGES, KernelCache, folder
     from .nested import NestedKernel
+    from .separate import SeparateKernel
 except (ImportError, AttributeError) as error:  # a test hides the names in a process of its own
     warnings.warn(
         f"numba {numba.__version__} lacks what quad_envs uses to compile fast ({error}): kernels are "
@@ -31,16 +32,20 @@ except (ImportError, AttributeError) as error:  # a test hides the names in a pr
         stacklevel=2,
     )
     PACKAGES = ("quad_envs", "controllers", "baselines")
-    KernelCache = NestedKernel = None  # type: ignore[assignment, misc]
+    KernelCache = NestedKernel = SeparateKernel = None  # type: ignore[assignment, misc]
 
 Int = int | np.int64  # an argument that a kernel may be given as a constant, see quad_envs.dynamics
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def _compile(function: Function, inline: bool, fused: bool = False, nogil: bool = False) -> Function:
+def _compile(
+    function: Function, inline: bool, fused: bool = False, nogil: bool = False, separate: bool = False
+) -> Function:
     if getattr(config, "DISABLE_JIT", False):
         return function
     options: Any = {"error_model": "numpy", "fastmath": {"contract"} if fused else False}
+    if separate and SeparateKernel is not None:
+        return cast(Function, SeparateKernel(function, {**options, "nogil": nogil}))
     if NestedKernel is None:
         return cast(Function, numba.njit(forceinline=inline, nogil=nogil, **options)(function))
     entry = cast(Any, numba.njit(nogil=nogil, **options)(function))
@@ -56,6 +61,14 @@ def kernel(function: Function) -> Function:
 def inline_kernel(function: Function) -> Function:
     """As `kernel`, but LLVM always inlines it into its caller, so that loops around it vectorise."""
     return _compile(function, inline=True)
+
+
+def separate_kernel(function: Function) -> Function:
+    """As `kernel`, but compiled once for all that call it: they hold its name, and no code of it.
+
+    For large ones that several others call. Sizes that a caller knows are not known in it.
+    """
+    return _compile(function, inline=False, nogil=True, separate=True)
 
 
 def threaded_kernel(function: Function) -> Function:

@@ -3,13 +3,15 @@
 Numba itself loads a kernel as if it were about to compile: it imports every function it can translate (with
 SciPy, for linear algebra) and prepares its runtime, which takes most of a warm start. Machine code needs none
 of it, only the C functions that it calls. They are listed with it; where one is not there, numba is prepared
-in full, and where it is still not there, the bytes are of no use here.
+in full, and where it is still not there, the bytes are of no use here. Separate kernels that it calls (see
+`separate`) are listed apart, since they are found in files.
 """
 
 from __future__ import annotations
 
 import io
 import pickle
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -27,6 +29,23 @@ for _owner, _needed in (
         raise ImportError(f"this version of numba has no {_owner.__name__}.{_needed}")
 
 
+_SEPARATE: dict[str, Any] = {}  # separate kernels of this process, by the names of their files
+_NAMES: dict[str, str] = {}  # of their symbols
+
+
+def publish(compiled: Any) -> None:
+    """Let kernels of this process be linked with a separate one, whose library is named as its file."""
+    name, symbol = compiled.library.name, compiled.fndesc.llvm_func_name
+    if name not in _SEPARATE:
+        llvm.add_symbol(symbol, compiled.library.get_pointer_to_function(symbol))
+        _SEPARATE[name], _NAMES[symbol] = compiled, name
+
+
+def published(name: str) -> Any:
+    """The separate kernel of that name; None if it is not in this process."""
+    return _SEPARATE.get(name)
+
+
 def pack(compiled: Any) -> bytes:
     """A compiled kernel, numba's `CompileResult`, as bytes."""
     (name, kind, (code, _)), descriptor, *rest = compiled._reduce()
@@ -38,21 +57,26 @@ def pack(compiled: Any) -> bytes:
         if symbol.is_declaration and not symbol.name.startswith("llvm.")
     ]
     library = name, kind, (code, _names_alone(descriptor))
-    return bytes(serialize.dumps((needed, library, descriptor, *rest)))
+    separate = [_NAMES[symbol] for symbol in needed if symbol in _NAMES]
+    return bytes(serialize.dumps((separate, needed, library, descriptor, *rest)))
 
 
-def unpack(raw: bytes, target: Any) -> Any:
+def unpack(raw: bytes, target: Any, load: Callable[[str], None]) -> Any:
     """The compiled kernel in the bytes of `pack`.
 
     Args:
         raw: What `pack` returned; it is trusted, as unpickling runs code.
         target: Numba's target context.
+        load: Publishes the separate kernel of a name, if it can.
 
     Raises:
         ValueError: If the kernel calls what is not there.
     """
-    needed, library, *rest = _Unpickler(io.BytesIO(raw)).load()
+    separate, needed, library, *rest = _Unpickler(io.BytesIO(raw)).load()
     _publish_runtime()
+    for name in separate:
+        if name not in _SEPARATE:
+            load(name)
     if _missing(needed):
         target.refresh()
         if _missing(needed):

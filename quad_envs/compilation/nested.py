@@ -57,18 +57,21 @@ def _hand_over(library: Any) -> None:
     library._finalized = True
 
 
+def replace_pass(state: Any, step: type, own: type) -> Any:
+    """Numba's pipeline with one step exchanged."""
+    manager = DefaultPassBuilder.define_nopython_pipeline(state)
+    manager.passes = [(own if each is step else each, why) for each, why in manager.passes]
+    manager._finalized = False
+    manager.finalize()
+    return manager
+
+
 class _InnerCompiler(CompilerBase):
     """Numba's pipeline with `_InnerLowering` in place of native lowering."""
 
     def define_pipelines(self) -> list[Any]:
         """The one pipeline."""
-        manager = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        manager.passes = [
-            (_InnerLowering if step is NativeLowering else step, why) for step, why in manager.passes
-        ]
-        manager._finalized = False
-        manager.finalize()
-        return [manager]
+        return [replace_pass(self.state, NativeLowering, _InnerLowering)]
 
 
 class NestedKernel(CPUDispatcher):
