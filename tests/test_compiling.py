@@ -35,11 +35,15 @@ def test_warm_calls_every_environment_and_policy_of_the_registries():
     assert any("apg" in title or "dagger" in title for title in titles)  # a network, too
 
 
-def test_environments_are_first_and_the_dearest_policies_next():
+def test_environments_are_first_then_the_dearest_mpc_then_what_shares_no_solver_with_it():
     env_id = "quad/HelixTracking-v0"
     first, *policies = [piece.title for piece in _pieces([_unit(env_id, name) for name in _policies(env_id)])]
-    prices = [TRACKING_POLICIES[name].decision_ms for name in policies if name in TRACKING_POLICIES]
-    assert first == env_id and prices == sorted(prices, reverse=True)
+    entries = [TRACKING_POLICIES[name] for name in policies if name in TRACKING_POLICIES]
+    assert first == env_id and {policies[0], policies[1]} <= TRACKING_POLICIES.keys()
+    assert [entry.mpc for entry in entries] == [True, *[False] * 5, *[True] * 3]
+    for group in (entries[:1] + entries[6:], entries[1:6]):
+        prices = [entry.decision_ms for entry in group]
+        assert prices == sorted(prices, reverse=True)
 
 
 def finish(pieces, helpers, monkeypatch):

@@ -7,8 +7,9 @@ import subprocess
 import sys
 import textwrap
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numba
 import numpy as np
@@ -18,7 +19,7 @@ from numba.core import config
 from numba.core.registry import cpu_target
 
 from quad_envs.compilation import cache
-from quad_envs.compilation.decorators import kernel
+from quad_envs.compilation.decorators import kernel, separate_kernel
 
 SOURCE = """
 from enum import IntEnum
@@ -293,7 +294,7 @@ EVERYTHING = """
 import sys
 from typing import NamedTuple
 import numpy as np
-from quad_envs.compilation.decorators import kernel
+from quad_envs.compilation.decorators import kernel, separate_kernel
 
 class Pair(NamedTuple):
     table: np.ndarray
@@ -442,6 +443,26 @@ def test_without_the_file_of_a_separate_kernel_all_that_call_it_are_compiled_ane
         assert separate.exists()
         assert run("first", "second").startswith("[7.0, 5.0]")
         assert run("first", "second").endswith("compiler loaded: False\n")
+
+
+def test_of_two_processes_that_need_the_same_separate_kernel_one_compiles_it(shared):
+    run, folder = shared
+    script = SHARED + "print('misses', sum(total.stats.cache_misses.values()))\n"
+    (folder.parent / "shared.py").write_text(script)
+    with ThreadPoolExecutor() as pool:
+        said = list(pool.map(run, ["first", "second"]))
+    assert sorted(text.splitlines()[-1] for text in said) == ["misses 0", "misses 1"]
+    assert [path.suffix for path in folder.iterdir()] == [".nbc"] * 3
+
+
+def test_where_files_cannot_be_locked_a_separate_kernel_is_compiled_all_the_same(tmp_path, monkeypatch):
+    monkeypatch.setattr(cache, "folder", lambda: tmp_path)
+    monkeypatch.setattr(cache, "folders", lambda: (tmp_path,))
+    for locks in (None, SimpleNamespace(flock=fails_to_write, LOCK_EX=0)):
+        monkeypatch.setattr(cache, "fcntl", locks)
+        compiled = separate_kernel(lambda x: 2.0 * x)
+        assert compiled(1.5) == 3.0
+    assert {path.suffix for path in tmp_path.iterdir()} == {".nbc"}
 
 
 ONE_STEP = """

@@ -105,7 +105,10 @@ def _short(unit: Unit) -> Unit:
 
 
 def _pieces(units: Sequence[Unit]) -> list[Piece]:
-    """Environments first, since whole flights need them; then decisions, the longest first."""
+    """Environments first, since whole flights need them; then decisions, the longest first.
+
+    All MPCs share a solver. One of them is next, and the others are last: until then it is compiled.
+    """
     hover = {unit.env.id: unit._replace(policy=PolicyChoice("hover"), policy_name="hover") for unit in units}
     envs = [Piece(unit.env.id, fly_unit, unit) for unit in hover.values()]
     policies: dict[tuple[str, str], Piece] = {}
@@ -114,7 +117,9 @@ def _pieces(units: Sequence[Unit]) -> list[Piece]:
         call = fly_unit if entry is None or entry.privileged else _decide
         key = unit.policy.name if entry else "a network", TEAMS.get(unit.env.id, "")
         policies.setdefault(key, Piece(unit.policy.name, call, unit))
-    return [*envs, *sorted(policies.values(), key=_decision_ms, reverse=True)]
+    longest = sorted(policies.values(), key=_decision_ms, reverse=True)
+    mpcs = [piece for piece in longest if (entry := registered(piece.unit)) is not None and entry.mpc]
+    return [*envs, *mpcs[:1], *(piece for piece in longest if piece not in mpcs), *mpcs[1:]]
 
 
 def _decision_ms(piece: Piece) -> float:

@@ -4,6 +4,7 @@ A kernel's file is named after a digest of its own code and of all that it reach
 constants it reads, the fields of the tuples it takes. So a comment, a moved file or another kernel of the
 same module leaves it valid, and a changed constant in another module does not. Files need no index and no
 lock: each is written whole under its final name, and one that cannot be read is deleted and made anew.
+Locks only spare work: of two processes that need the same separate kernel, one compiles it.
 """
 
 from __future__ import annotations
@@ -28,6 +29,11 @@ from numba.core import config, types
 from .digest import digest
 from .kernel_file import pack, publish, published, unpack
 from .portable import CPU, NEEDED, SHIPPED
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 PACKAGES = ("quad_envs", "controllers", "baselines")
 _HEADER = hashlib.sha256().digest_size  # bytes before the kernel: its checksum
@@ -164,6 +170,25 @@ class KernelCache:
             os.replace(unfinished, place / f"{name}.nbc")
             self._sweep(place)
 
+    @contextlib.contextmanager
+    def turn(self, signature: Any, target: Any) -> Iterator[None]:
+        """Keep other processes from compiling the same at the same time; they load it after this one.
+
+        Where locks are not to be had, each compiles for itself.
+        """
+        place = folder()
+        if fcntl is None or place is None:
+            yield
+            return
+        path = place / f"{self.name(signature, target.codegen().magic_tuple())}.lock"
+        with contextlib.ExitStack() as held:
+            with contextlib.suppress(OSError):
+                file = held.enter_context(path.open("w"))
+                fcntl.flock(file, fcntl.LOCK_EX)
+            yield
+            with contextlib.suppress(OSError):
+                path.unlink()
+
     def name(self, signature: Any, processor: tuple[str, ...]) -> str:
         """Of the file, without its suffix, for these argument types."""
         if self._digest is None:
@@ -175,7 +200,7 @@ class KernelCache:
     def _sweep(self, place: Path) -> None:
         """Delete what older versions of this kernel, and writers that died, left a while ago."""
         since = time.time() - _OUTDATED
-        for path in [*place.glob(f"{self._name}-*.nbc"), *place.glob("*.tmp")]:
+        for path in [*place.glob(f"{self._name}-*.nbc"), *place.glob("*.tmp"), *place.glob("*.lock")]:
             if f"-{self._digest}-" not in path.name:
                 with contextlib.suppress(OSError):
                     if path.stat().st_mtime < since:

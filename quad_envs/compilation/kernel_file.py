@@ -38,7 +38,7 @@ def publish(compiled: Any) -> None:
     name, symbol = compiled.library.name, compiled.fndesc.llvm_func_name
     if name not in _SEPARATE:
         llvm.add_symbol(symbol, compiled.library.get_pointer_to_function(symbol))
-        _SEPARATE[name], _NAMES[symbol] = compiled, name
+        _SEPARATE[name], _NAMES[symbol] = compiled._replace(metadata=None), name
 
 
 def published(name: str) -> Any:

@@ -15,9 +15,11 @@ from numba.core import itanium_mangler
 from numba.core.base import BaseContext
 from numba.core.codegen import CPUCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.compiler_machinery import register_pass
 from numba.core.funcdesc import qualifying_prefix
 from numba.core.registry import CPUDispatcher
+from numba.core.sigutils import normalize_signature
 from numba.core.typed_passes import NativeLowering
 
 from .cache import KernelCache
@@ -78,6 +80,15 @@ class SeparateKernel(CPUDispatcher):
         own = {**options, "nopython": True, "boundscheck": None}
         super().__init__(py_func=function, targetoptions=own, pipeline_class=_SeparateCompiler)
         self._cache = _CACHES[function] = KernelCache(self)
+
+    def compile(self, signature: Any) -> Any:
+        """The compiled form for these argument types, by whichever process comes first."""
+        arguments, _ = normalize_signature(signature)
+        if tuple(arguments) in self.overloads:
+            return super().compile(signature)
+        # The compiler's lock first: a thread that holds it may come here, too.
+        with global_compiler_lock, self._cache.turn(arguments, self.targetctx):
+            return super().compile(signature)
 
     def add_overload(self, compiled: Any) -> None:
         """A compiled form is there; kernels that call it find its symbol and link no code."""
