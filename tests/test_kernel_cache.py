@@ -7,9 +7,8 @@ import subprocess
 import sys
 import textwrap
 import warnings
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 
 import numba
 import numpy as np
@@ -19,7 +18,7 @@ from numba.core import config
 from numba.core.registry import cpu_target
 
 from quad_envs.compilation import cache
-from quad_envs.compilation.decorators import kernel, separate_kernel
+from quad_envs.compilation.decorators import kernel
 
 SOURCE = """
 from enum import IntEnum
@@ -294,7 +293,7 @@ EVERYTHING = """
 import sys
 from typing import NamedTuple
 import numpy as np
-from quad_envs.compilation.decorators import kernel, separate_kernel
+from quad_envs.compilation.decorators import kernel
 
 class Pair(NamedTuple):
     table: np.ndarray
@@ -372,97 +371,6 @@ def test_a_kernel_that_calls_what_is_not_there_is_compiled_anew(tmp_path, monkey
         kernel_file.unpack(packed, cpu_target.target_context, load=lambda name: None)
     again = fresh_kernel(tmp_path, monkeypatch)
     assert again(1.5) == 3.0 and sum(again.entry.stats.cache_misses.values()) == 1
-
-
-SHARED = """
-import sys
-import numpy as np
-from quad_envs.compilation.decorators import kernel, separate_kernel
-
-@kernel
-def twice(x):
-    return 2.0 * x
-
-@separate_kernel
-def total(x):
-    if x.size > 3:
-        raise ValueError("at most three")
-    return twice(x).sum()
-
-@kernel
-def first(x):
-    return total(x) + 1.0
-
-@kernel
-def second(x):
-    return total(x) - 1.0
-
-print([{"first": first, "second": second, "total": total}[name](np.ones(3)) for name in sys.argv[1:]])
-try:
-    first(np.ones(4))
-except ValueError as error:
-    print(error)
-print("compiler loaded:", "numba.np.arraymath" in sys.modules)
-"""
-
-
-@pytest.fixture
-def shared(tmp_path):
-    """Runs `SHARED` with names of kernels to call; the folder of their files."""
-    script = tmp_path / "shared.py"
-    script.write_text(SHARED)
-
-    def run(*names):
-        command = [sys.executable, str(script), *names]
-        environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
-
-    return run, tmp_path / "quad-envs"
-
-
-def test_a_separate_kernel_is_compiled_once_for_all_that_call_it_in_any_process(shared):
-    run, folder = shared
-    assert run("first") == "[7.0]\nat most three\ncompiler loaded: True\n"
-    (separate,) = folder.glob("__main__.total-*.nbc")
-    made = separate.stat().st_mtime_ns
-    assert run("second", "total").startswith("[5.0, 6.0]\nat most three")
-    assert separate.stat().st_mtime_ns == made
-    assert {path.name.split("-")[0] for path in folder.iterdir()} == {
-        "__main__.first", "__main__.second", "__main__.total"
-    }  # fmt: skip
-    assert run("second", "first") == "[5.0, 7.0]\nat most three\ncompiler loaded: False\n"
-
-
-def test_without_the_file_of_a_separate_kernel_all_that_call_it_are_compiled_anew(shared):
-    run, folder = shared
-    run("first", "second")
-    (separate,) = folder.glob("__main__.total-*.nbc")
-    for damage in (separate.unlink, lambda: separate.write_bytes(b"cut")):
-        damage()
-        assert run("first") == "[7.0]\nat most three\ncompiler loaded: True\n"
-        assert separate.exists()
-        assert run("first", "second").startswith("[7.0, 5.0]")
-        assert run("first", "second").endswith("compiler loaded: False\n")
-
-
-def test_of_two_processes_that_need_the_same_separate_kernel_one_compiles_it(shared):
-    run, folder = shared
-    script = SHARED + "print('misses', sum(total.stats.cache_misses.values()))\n"
-    (folder.parent / "shared.py").write_text(script)
-    with ThreadPoolExecutor() as pool:
-        said = list(pool.map(run, ["first", "second"]))
-    assert sorted(text.splitlines()[-1] for text in said) == ["misses 0", "misses 1"]
-    assert [path.suffix for path in folder.iterdir()] == [".nbc"] * 3
-
-
-def test_where_files_cannot_be_locked_a_separate_kernel_is_compiled_all_the_same(tmp_path, monkeypatch):
-    monkeypatch.setattr(cache, "folder", lambda: tmp_path)
-    monkeypatch.setattr(cache, "folders", lambda: (tmp_path,))
-    for locks in (None, SimpleNamespace(flock=fails_to_write, LOCK_EX=0)):
-        monkeypatch.setattr(cache, "fcntl", locks)
-        compiled = separate_kernel(lambda x: 2.0 * x)
-        assert compiled(1.5) == 3.0
-    assert {path.suffix for path in tmp_path.iterdir()} == {".nbc"}
 
 
 ONE_STEP = """
