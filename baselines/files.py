@@ -26,6 +26,7 @@ import platform
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib import metadata
@@ -39,6 +40,7 @@ import quad_envs
 from .errors import ResultsError
 
 _LOCK = ".lock"
+_UNFINISHED = 600.0  # s after which a file that is being written belongs to nobody
 FAILURES = "failures.json"
 _RESULTS = (
     "results.csv",
@@ -205,11 +207,21 @@ def locked(folder: Path) -> Iterator[None]:
         file.truncate(0)
         json.dump({"pid": os.getpid(), "host": socket.gethostname()}, file)
         file.flush()
+        _sweep(folder)
         try:
             yield
         finally:
             with suppress(OSError):
                 file.truncate(0)
+
+
+def _sweep(folder: Path) -> None:
+    """Delete what writers that died left unfinished; another that is at work has a young file."""
+    since = time.time() - _UNFINISHED
+    for path in folder.rglob(".*.tmp"):
+        with suppress(OSError):
+            if path.stat().st_mtime < since:
+                path.unlink()
 
 
 @contextmanager

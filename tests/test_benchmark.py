@@ -248,6 +248,16 @@ def test_a_folder_is_free_when_its_process_was_killed(tmp_path):
         assert json.loads((tmp_path / ".lock").read_text())["pid"] == os.getpid()
 
 
+def test_what_a_dead_writer_left_is_swept_and_what_another_writes_is_not(tmp_path):
+    (tmp_path / "cells").mkdir()
+    old, young = tmp_path / "cells/.a.json.12.tmp", tmp_path / ".b.json.13.tmp"
+    for path in (old, young):
+        path.write_text("half")
+    os.utime(old, (0, 0))
+    with locked(tmp_path):
+        assert young.exists() and not old.exists()
+
+
 def test_the_lock_is_that_of_an_open_file_and_not_of_its_name(tmp_path):
     """Were the file removed at the end, one process could hold the old one and another the new one."""
     with locked(tmp_path):
