@@ -2,13 +2,14 @@
 
 import csv
 import json
+import re
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import baselines.training.tuning as tuning
-from baselines import CheckpointError, ResultsError, evaluate, make_policy, tune
+from baselines import CheckpointError, ResultsError, TrainingError, evaluate, make_policy, tune
 from baselines.__main__ import main
 from baselines.training.held_out import HELD_OUT
 from baselines.training.tuned_options import KNOBS, make_search
@@ -162,6 +163,33 @@ def test_a_tuned_folder_is_refused_by_another_task_or_vehicle(tmp_path):
     (tmp_path / "tuned.json").write_text("{}")
     with pytest.raises(CheckpointError, match=r"cannot read tuned\.json"):
         make_policy(tmp_path, HELIX)
+
+
+def test_a_task_that_no_candidate_survives_is_said_to_be_one_and_what_was_tried_is_kept(tmp_path, capsys):
+    rolling = (0.0,) * 6 + (1.4, 0.0, 0.0, 30.0, 0.0, 0.0)  # past 85 degrees within a sample
+    doomed = {"start": rolling, "start_box": 0.0, **SHORT}
+    said = (
+        r"no candidate for 'nmpc' stays in the air on quad/HelixTracking-v0: all 20 flights of the best "
+        r"one crash; begin from options that fly \(--policy-set\), or make the task easier\. What was tried"
+    )
+    with pytest.raises(TrainingError, match=said):
+        tune(HELIX, "nmpc", episodes=GENERATION, out=tmp_path / "a", fields=("R",), env_kwargs=doomed)
+    rows = list(csv.DictReader((tmp_path / "a" / "curve.csv").read_text().splitlines()))
+    assert [row["crashes"] for row in rows] == ["20", "20"]
+    words = [
+        "tune",
+        HELIX,
+        "nmpc",
+        "--episodes",
+        str(GENERATION),
+        "--tuned",
+        "R",
+        "--out",
+        str(tmp_path / "b"),
+    ]
+    settings = [word for name, value in doomed.items() for word in ("--set", f"{name}={json.dumps(value)}")]
+    assert main([*words, *settings]) == 1
+    assert re.search(said, capsys.readouterr().err)
 
 
 def test_the_command_tunes_and_evaluate_takes_its_folder(tmp_path, capsys):
