@@ -44,7 +44,7 @@ def base_problem(rng: np.random.Generator) -> OcpQp:
     return OcpQp(
         A=np.ascontiguousarray(A), B=np.ascontiguousarray(B), c=0.1 * rng.normal(size=(N, n)),
         Q=Q[None].copy(),
-        R=np.diag(10.0 ** rng.uniform(-1.0, 1.0, m)), Q_f=Q.copy(), stationary=False,
+        R=np.diag(10.0 ** rng.uniform(-1.0, 1.0, m))[None], Q_f=Q.copy(), stationary=False,
         x_0=rng.normal(size=n) * 10.0 ** rng.uniform(-2.0, 1.5), r=rng.normal(size=(N + 1, n)),
         lower=lower, upper=upper, rate_step=float(rng.choice([np.inf, 0.05, 0.5, 2.0])),
         u_last=rng.uniform(lower, upper), rows=rows,
@@ -57,7 +57,9 @@ def _hard(rng: np.random.Generator, qp: OcpQp) -> OcpQp:
 
 def _weights(rng: np.random.Generator, qp: OcpQp) -> OcpQp:
     Q = np.diag(10.0 ** rng.uniform(-8.0, 8.0, N_STATE))
-    return qp._replace(Q=Q[None].copy(), Q_f=Q.copy(), R=np.diag(10.0 ** rng.uniform(-6.0, 6.0, N_INPUT)))
+    return qp._replace(
+        Q=Q[None].copy(), Q_f=Q.copy(), R=np.diag(10.0 ** rng.uniform(-6.0, 6.0, N_INPUT))[None]
+    )
 
 
 def _unstable(rng: np.random.Generator, qp: OcpQp) -> OcpQp:

@@ -39,7 +39,7 @@ def hover_qp(N, x_0, upper=5.88, rate_step=np.inf, rows=None):
         B=HOVER[1][None],
         c=np.zeros((N, 12)),
         Q=np.eye(12)[None],
-        R=np.eye(4),
+        R=np.eye(4)[None],
         Q_f=HOVER_P,
         stationary=True,
         x_0=np.asarray(x_0, dtype=float),
@@ -84,11 +84,12 @@ def random_qp(rng, N, model, limits):
     n_models = N if model == "ltv" else 1
     pairs = [model_pair(rng, 0.3) for _ in range(n_models)]
     A, B = (np.array([pair[k] for pair in pairs]) for k in range(2))
-    Q = np.eye(12)[None]
+    Q, R = np.eye(12)[None], np.eye(4)[None]
     c = np.zeros((N, 12))
     if model == "ltv":
         root = 0.3 * rng.normal(size=(N, 12, 12))
         Q = root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(12)
+        R = np.random.default_rng(N).uniform(0.05, 2.0, (N, 1, 1)) * R
         c = 0.02 * rng.normal(size=(N, 12))
     x_0 = START_SCALE * rng.normal(size=12)
     r = np.zeros((N + 1, 12))
@@ -99,7 +100,7 @@ def random_qp(rng, N, model, limits):
         B=B,
         c=c,
         Q=Q,
-        R=np.eye(4),
+        R=R,
         Q_f=dare(A[0], B[0], Q[0], np.eye(4)) if model == "stationary" else HOVER_P,
         stationary=model == "stationary",
         x_0=x_0,

@@ -13,7 +13,7 @@ def backward(problem):
     for i in range(N - 1, -1, -1):
         A, B = (pairs[i if len(pairs) > 1 else 0] for pairs in (problem.A, problem.B))
         P_next[i] = P
-        S[i] = problem.R + B.T @ P @ B
+        S[i] = problem.R[i if len(problem.R) > 1 else 0] + B.T @ P @ B
         K[i] = np.linalg.solve(S[i], B.T @ P @ A)
         P = problem.Q[i if len(problem.Q) > 1 else 0] + A.T @ P @ (A - B @ K[i])
         P = 0.5 * (P + P.T)

@@ -158,7 +158,7 @@ def test_the_problem_of_a_decision_has_the_plan_of_that_decision(kind):
 def test_the_problem_of_a_law_has_its_gain_as_the_best_one(kind):
     law, plant, rows = kind(TASK), at_rest((0.2, 0.1, -0.1), (0.1, 0.05, -0.2)), window(rest, 0, 0)
     qp = law.problem(plant, rows, np.full(4, 1.96), np.zeros(6), np.zeros(0))
-    u = -best_gain(qp.A[0], qp.B[0], qp.Q_f, qp.R) @ (qp.x_0 - qp.r[0])
+    u = -best_gain(qp.A[0], qp.B[0], qp.Q_f, qp.R[0]) @ (qp.x_0 - qp.r[0])
     np.testing.assert_allclose(decide_once(law, plant, rows).command[0] + qp.lower, u, atol=1e-9)
 
 

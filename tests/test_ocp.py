@@ -13,7 +13,8 @@ def cost(qp, u):
     total, x = 0.0, qp.x_0
     for i, u_i in enumerate(u):
         e = x - qp.r[i]
-        total += 0.5 * (e @ qp.Q[i if len(qp.Q) > 1 else 0] @ e + u_i @ qp.R @ u_i)
+        Q, R = (weight[i if len(weight) > 1 else 0] for weight in (qp.Q, qp.R))
+        total += 0.5 * (e @ Q @ e + u_i @ R @ u_i)
         j = i if len(qp.A) > 1 else 0
         x = qp.A[j] @ x + qp.B[j] @ u_i + qp.c[i]
     e = x - qp.r[-1]
@@ -86,7 +87,13 @@ ROWS = tilt_rows(4, 0.3, 1.0)
         ({"c": np.zeros((4, 24))[:, ::2]}, "c must be C-contiguous"),
         ({"c": np.zeros((4, 12), dtype=np.float32)}, "c must be a float64 array, got float32"),
         ({"lower": np.full(4, 9.0)}, "input box needs lower <= upper"),
-        ({"R": np.zeros((4, 4))}, "R must be positive definite"),
+        ({"R": np.zeros((1, 4, 4))}, "R must be positive definite"),
+        ({"R": np.eye(4)}, "R must have shape"),
+        ({"R": np.repeat(np.eye(4)[None], 4, axis=0)}, "one Q and one R, got 1 pairs, 1 Q and 4 R"),
+        (
+            {"R": np.repeat(np.eye(4)[None], 4, axis=0), "R_rate": np.eye(4), "stationary": False},
+            "R_rate and R of each stage need A, B and Q of each stage",
+        ),
         ({"Q": np.triu(np.ones((12, 12)))[None]}, "Q must be symmetric"),
         ({"rate_step": -1.0}, "rate_step must be >= 0"),
         ({"Q": np.repeat(np.eye(12)[None], 4, axis=0)}, "stationary needs one pair"),

@@ -37,8 +37,8 @@ def cost_of(qp, u):
     """The cost of a plan as `ocp.py` writes it, without the soft rows."""
     e, total, before = roll_out(qp, u) - qp.r, 0.0, qp.u_last
     for i, u_i in enumerate(u):
-        Q = qp.Q[i if len(qp.Q) > 1 else 0]
-        total += e[i] @ Q @ e[i] + u_i @ qp.R @ u_i + (u_i - before) @ qp.R_rate @ (u_i - before)
+        Q, R = (weight[i if len(weight) > 1 else 0] for weight in (qp.Q, qp.R))
+        total += e[i] @ Q @ e[i] + u_i @ R @ u_i + (u_i - before) @ qp.R_rate @ (u_i - before)
         before = u_i
     return 0.5 * (total + e[-1] @ qp.Q_f @ e[-1])
 

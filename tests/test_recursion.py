@@ -93,7 +93,7 @@ def test_the_plan_of_pairs_met_on_a_violent_flight_equals_the_readable_recursion
         A, B = (np.ascontiguousarray([pair[k] for pair in pairs]) for k in range(2))
         c, r = 0.1 * rng.normal(size=(25, 12)), rng.normal(size=(26, 12))
         x_0 = VIOLENT * rng.normal(size=12)
-        agree_with_the_twin(Regulator(A, B, c, np.eye(12)[None], np.eye(4), HOVER_P, False, x_0, r))
+        agree_with_the_twin(Regulator(A, B, c, np.eye(12)[None], np.eye(4)[None], HOVER_P, False, x_0, r))
 
 
 def test_a_problem_over_states_and_last_inputs_equals_the_readable_recursion():
@@ -104,7 +104,7 @@ def test_a_problem_over_states_and_last_inputs_equals_the_readable_recursion():
         root = rng.normal(size=(9, 16, 16))
         Q = root @ np.swapaxes(root, 1, 2)
         c, r, x_0 = rng.normal(size=(9, 16)), rng.normal(size=(10, 16)), rng.normal(size=16)
-        agree_with_the_twin(Regulator(A, B, c, Q, np.eye(4), Q[0].copy(), False, x_0, r))
+        agree_with_the_twin(Regulator(A, B, c, Q, np.eye(4)[None], Q[0].copy(), False, x_0, r))
 
 
 def test_the_cost_to_go_stays_symmetric():

@@ -116,13 +116,13 @@ def _sample(
     cost, end = np.nan, np.full(len(qp.x_0), np.nan)
     if solution is not None:
         cost, end = plan_cost(qp, solution.u, solution.x), solution.x[-1]
-    return Sample(qp, cost, end, best_gain(qp.A[-1], qp.B[-1], qp.Q_f, qp.R), command + qp.lower)
+    return Sample(qp, cost, end, best_gain(qp.A[-1], qp.B[-1], qp.Q_f, qp.R[-1]), command + qp.lower)
 
 
 def _examine(sample: Sample, solver: StructuredSolver) -> dict[str, float]:
     """What one sample says by itself."""
     qp, K = sample.qp, sample.gain
-    A, B, Q, R = qp.A[-1], qp.B[-1], qp.Q[-1], qp.R
+    A, B, Q, R = qp.A[-1], qp.B[-1], qp.Q[-1], qp.R[-1]
     decrease = terminal_decrease(A, B, K, qp.Q_f, Q, R)
     try:
         K_x, P_x = lqr_gain(A, B, Q, R)

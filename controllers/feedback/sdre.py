@@ -191,7 +191,7 @@ class Sdre(FeedbackLaw):
         params = self.task.params
         A, B = hover_pair(params, dt) if alpha < 0.0 else sdc_pair(x, params, dt, alpha)
         return OcpQp(
-            A[None], B[None], np.zeros((0, N_STATE)), Q[None], R, dare(A, B, Q, R), True, x, r,
+            A[None], B[None], np.zeros((0, N_STATE)), Q[None], R[None], dare(A, B, Q, R), True, x, r,
             -offset, force_max - offset, rate_step, last - offset, no_rows(),
         )  # fmt: skip
 

@@ -37,7 +37,6 @@ from .residual import gauss_newton_weight, stage_residual
 from .score import (
     ALLOWED,
     COST_FLOOR,
-    begin_weighing,
     loses_more,
     restore_guess,
     set_floor,
@@ -96,7 +95,7 @@ def load_guess(plan: Array, kept: Array, heading: bool, s: Scratch) -> bool:
 def begin_passes(floor: float, plan: Array, kept: Array, heading: bool, s: Scratch) -> None:
     """The guess of the first pass; only about a previous solution are there weights of the score."""
     held = load_guess(plan, kept, heading, s)
-    begin_weighing(floor if held else COST_FLOOR, s)
+    set_floor(floor if held else COST_FLOOR, s)
 
 
 @kernel
@@ -239,7 +238,7 @@ def _decide_rows(
             linearise_cost(inertial, data, s)
             weigh_stages(data, s)
             has_plan = memories[j, 0] > 0.0
-            level, count = solve_within_model(s.A, s.B, s.Q, s.P, False, s.target, has_plan, data, s, ws)
+            level, count = solve_within_model(s.A, s.B, s.Q, s.R, s.P, False, s.target, has_plan, data, s, ws)
             worst, iterations = max(worst, level), iterations + count
             if level > RELAXED or accept_plan(number, passes, floor, inertial, data, s, ws):
                 break
@@ -288,7 +287,7 @@ class ExactNmpc(Mpc):
         linearise_model(self._data, s)
         linearise_cost(self._inertial, self._data, s)
         weigh_stages(self._data, s)
-        return Problem(s.A, s.B, s.Q, s.P, False, s.target)
+        return Problem(s.A, s.B, s.Q, s.R, s.P, False, s.target)
 
     def _accept(self, number: int, s: Scratch, ws: Workspace) -> bool:
         return accept_plan(number, self.passes, self._floor, self._inertial, self._data, s, ws)

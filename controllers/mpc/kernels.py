@@ -39,7 +39,7 @@ class MpcData(NamedTuple):
     coefficients: Annotated[Array, "N_COEFFICIENTS"]
     B_c: Annotated[Array, "12, 4"]
     Q: Annotated[Array, "1, 12, 12"]
-    R: Annotated[Array, "4, 4"]
+    R: Annotated[Array, "1, 4, 4"]
     R_rate: Annotated[Array, "4 or 0, 4"]  # 0 for none
     P: Annotated[Array, "12, 12"]  # weight of x_N: solves the Riccati equation of the hover pair
     normals: Annotated[Array, "H, 12"]  # outputs with limits
@@ -92,12 +92,13 @@ class Scratch(NamedTuple):
     work: Array  # (ESTIMATOR_SCRATCH,)
     working: Array  # (N,), working set of the solver, one number per stage
     Q: Array  # (M, 12, 12), stage weights; M = N where a guess is kept, else 0
+    R: Array  # (M, 4, 4), those of the inputs
     target: Array  # (M+1, 12), references that go with them
     X: Array  # (M+1, 12), guess of the states
     F: Array  # (M, 4), and of the rotor forces
     points: Array  # (1 or N, 12), states at which the pairs were taken; hover: zeros
     loss: Array  # (M,), stage costs l(x_{i+1}, u_i) of the guess
-    weighing: Array  # (2,), of the stages in the next pass, entries as in `score`
+    floor: Array  # (1,), least weight of a stage in the next pass, see `score.weigh_stages`
 
 
 def buffer_size(N: int, pairs: int, H: int, K: int, M: int) -> int:
@@ -105,7 +106,7 @@ def buffer_size(N: int, pairs: int, H: int, K: int, M: int) -> int:
     n, m = N_STATE, N_INPUT
     vectors = 2 * n + 4 * m + 2 * N_DISTURBANCE + ESTIMATOR_SCRATCH
     stages = n * (2 * N + 1) + pairs * n * (n + m) + n * H + 3 * K
-    guess = M * n * n + 2 * n * (M + 1) + m * M + M + 2
+    guess = M * (n * n + m * m) + 2 * n * (M + 1) + m * M + M + 1
     return vectors + N + stages + (2 + DARE_SCRATCH) * n * n + guess + pairs * n
 
 
@@ -140,6 +141,8 @@ def carve(buffer: Array, N: int, pairs: int, H: int, K: int, M: int) -> Scratch:
     i += rows.size
     Q = take_blocks(buffer, i, M, n, n)
     i += Q.size
+    R = take_blocks(buffer, i, M, m, m)
+    i += R.size
     target = take(buffer, i, M + 1, n)
     i += target.size
     X = take(buffer, i, M + 1, n)
@@ -149,13 +152,13 @@ def carve(buffer: Array, N: int, pairs: int, H: int, K: int, M: int) -> Scratch:
     points = take(buffer, i, pairs, n)
     i += points.size
     loss = take(buffer, i, 1, M)[0]
-    weighing = take(buffer, i + M, 1, 2)[0]
+    floor = take(buffer, i + M, 1, 1)[0]
     o = 2 * n + 4 * m
     return Scratch(
         v[:n], v[n : 2 * n], v[2 * n : 2 * n + m], v[2 * n + m : 2 * n + 2 * m],
         v[2 * n + 2 * m : 2 * n + 3 * m], v[2 * n + 3 * m : o], v[o : o + e], v[o + e : o + 2 * e],
         r, c, A, B, normals, rows[0], rows[1], rows[2], square[0], square[1], square[2:], v[o + 2 * e :],
-        working, Q, target, X, F, points, loss, weighing,
+        working, Q, R, target, X, F, points, loss, floor,
     )  # fmt: skip
 
 
@@ -244,6 +247,7 @@ def solve_row(
     A: Array,
     B: Array,
     Q: Array,
+    R: Array,
     Q_f: Array,
     stationary: bool,
     r: Array,
@@ -272,7 +276,7 @@ def solve_row(
         s.working[i] = 0.0
     while True:
         qp = OcpQp(
-            A, B, s.c, Q, data.R, Q_f, stationary, s.x_0, r, s.lower, s.upper, rate_step, s.u_last, rows,
+            A, B, s.c, Q, R, Q_f, stationary, s.x_0, r, s.lower, s.upper, rate_step, s.u_last, rows,
             data.R_rate,
         )  # fmt: skip
         status, count = solve_qp(qp, data.iteration_limit, warm, ws)
@@ -313,6 +317,7 @@ def solve_within_model(
     A: Array,
     B: Array,
     Q: Array,
+    R: Array,
     Q_f: Array,
     stationary: bool,
     r: Array,
@@ -326,10 +331,10 @@ def solve_within_model(
     Most plans never come near: to leave those rows out at first costs them nothing.
     """
     H, K = data.own_outputs, data.own_rows
-    level, iterations = solve_row(A, B, Q, Q_f, stationary, r, has_plan, H, K, data, s, ws)
+    level, iterations = solve_row(A, B, Q, R, Q_f, stationary, r, has_plan, H, K, data, s, ws)
     if level <= RELAXED and leaves_bound(ws.x, data.plan_bound):
         H, K = data.normals.shape[0], data.normal.shape[0]
-        again, count = solve_row(A, B, Q, Q_f, stationary, r, has_plan, H, K, data, s, ws)
+        again, count = solve_row(A, B, Q, R, Q_f, stationary, r, has_plan, H, K, data, s, ws)
         level, iterations = max(level, again), iterations + count
     return level, iterations
 

@@ -68,7 +68,9 @@ def _decide_rows(
         begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
         hold_trim(A, s.trim, s.c)
         has_plan = memories[j, 0] > 0.0
-        level, iterations = solve_within_model(A, B, data.Q, data.P, stationary, s.r, has_plan, data, s, ws)
+        level, iterations = solve_within_model(
+            A, B, data.Q, data.R, data.P, stationary, s.r, has_plan, data, s, ws
+        )
         end_row(level, plants[j], lasts[j], disturbances[j], memories[j], data, s, ws.u, commands[j], kept[j])
         left = left_model(level, s.x_0, ws.x, s.points, data.model_tilt, data.first_angle)
         report[0, j], report[1, j], report[2, j] = level, iterations, left
@@ -109,4 +111,5 @@ class LinearMPC(Mpc):
 
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
         hold_trim(self._A, s.trim, s.c)
-        return Problem(self._A, self._B, self._data.Q, self._data.P, not self.options.own_terminal, s.r)
+        data, stationary = self._data, not self.options.own_terminal
+        return Problem(self._A, self._B, data.Q, data.R, data.P, stationary, s.r)

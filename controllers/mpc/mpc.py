@@ -67,6 +67,7 @@ class Problem(NamedTuple):
     A: Array  # (1 or N, 12, 12)
     B: Array  # (1 or N, 12, 4)
     Q: Array  # (1 or N, 12, 12)
+    R: Array  # (1 or N, 4, 4)
     Q_f: Array  # (12, 12)
     stationary: bool
     r: Array  # (N+1, 12)
@@ -135,7 +136,7 @@ def mpc_data(task: BaseTask, options: MpcOptions, axes: VelocityAxes) -> MpcData
         coefficients=params.coefficients(),
         B_c=params.input_matrix(),
         Q=np.ascontiguousarray(Q[None]),
-        R=R,
+        R=np.ascontiguousarray(R[None]),
         R_rate=change_weight(options.R_rate),
         P=P,
         normals=rows.normals,
@@ -367,8 +368,9 @@ class Mpc(ABC):
             s.normals[:H], data.normal[:K], data.stage[:K], s.row_lower[:K], s.row_upper[:K], s.weight[:K]
         )
         return OcpQp(
-            *problem[:2], s.c, problem.Q, self._data.R, *problem[3:5], s.x_0, problem.r, s.lower, s.upper,
-            self._data.rate_step, s.u_last, rows, data.R_rate if len(data.R_rate) else None,
+            problem.A, problem.B, s.c, problem.Q, problem.R, problem.Q_f, problem.stationary, s.x_0,
+            problem.r, s.lower, s.upper, data.rate_step, s.u_last, rows,
+            data.R_rate if len(data.R_rate) else None,
         )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:

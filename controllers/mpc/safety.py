@@ -205,7 +205,9 @@ def _filter_rows(
             if told:
                 draw_first_input(wanted[j], weight, s)
                 balance(wanted[j], weight, data, s, ws)
-            level, count = solve_within_model(s.A, s.B, s.Q, s.P, False, s.target, has_plan, data, s, ws)
+            level, count = solve_within_model(
+                s.A, s.B, s.Q, data.R, s.P, False, s.target, has_plan, data, s, ws
+            )
             worst, iterations = max(worst, level), iterations + count
             if level > RELAXED or take_step(ws.u, ws.x, s) < CONVERGED:
                 break

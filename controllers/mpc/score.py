@@ -18,15 +18,13 @@ COST_FLOOR = 1.0  # of the weights: all are equal, which is the quadratic cost
 # By how much of the score, per stage, a plan may be predicted to lose more than a guess of another state.
 # Gusts, and the shift by a sample, do less to a guess.
 ALLOWED = 0.05
-# Entries of `Scratch.weighing`.
-_FLOOR = 0  # least weight of a stage over the largest one
-_SOFT = 1  # factor that the weights of the rows have now
+_LIGHTEST = 1e-300  # where all stage costs of a guess are too large for their slopes
 
 
 @kernel
 def stage_loss(e: Array, u: Array, data: MpcData) -> float:
     """The stage cost l = |e|_Q^2 + |u|_R^2 of an error (12,) and an input (4,)."""
-    Q, R, total = data.Q[0], data.R, 0.0
+    Q, R, total = data.Q[0], data.R[0], 0.0
     for a in range(N_STATE):
         row = 0.0
         for b in range(N_STATE):
@@ -74,44 +72,31 @@ def _scale(factor: float, M: Array) -> None:
 def weigh_stages(data: MpcData, s: Scratch) -> None:
     """Weigh the stages of a problem made by `exact.linearise_cost` with the slopes of f at the guess.
 
-    The solver has one R for all stages, and that keeps the weight of the first one: the others have theirs
-    over that. x_N has that of its stage. No weight is less than the floor times the largest one; a floor of 1
-    leaves the quadratic cost. Soft rows keep their weight over the heaviest stage.
+    Only ratios of weights matter, so that the heaviest stage has 1 and soft rows keep their weight beside it.
+    No weight is less than the floor; a floor of 1 leaves the quadratic cost. x_N has that of its stage.
     """
-    N, floor = s.loss.shape[0], s.weighing[_FLOOR]
-    soft = 1.0
-    if floor < COST_FLOOR:
-        heaviest = 0.0
-        for i in range(N):
-            heaviest = max(heaviest, tangent_weight(s.loss[i]))
-        least = floor * heaviest
-        first = max(tangent_weight(s.loss[0]), least)
-        for i in range(1, N):
-            _scale(max(tangent_weight(s.loss[i - 1]), least) / first, s.Q[i])
-        _scale(max(tangent_weight(s.loss[N - 1]), least) / first, s.P)
-        soft = heaviest / first
-    if soft != s.weighing[_SOFT]:
-        for k in range(s.weight.shape[0]):
-            s.weight[k] *= soft / s.weighing[_SOFT]
-        s.weighing[_SOFT] = soft
-
-
-@kernel
-def begin_weighing(floor: float, s: Scratch) -> None:
-    """The floor of the first pass of a decision, whose rows have the weights of the task."""
-    s.weighing[_FLOOR], s.weighing[_SOFT] = floor, 1.0
+    N, floor = s.loss.shape[0], s.floor[0]
+    heaviest = _LIGHTEST
+    for i in range(N):
+        heaviest = max(heaviest, tangent_weight(s.loss[i]))
+    for i in range(N):
+        copy(data.R[0], s.R[i])
+        if floor < COST_FLOOR:
+            weight = max(tangent_weight(s.loss[i]) / heaviest, floor)
+            _scale(weight, s.R[i])
+            _scale(weight, s.Q[i + 1] if i + 1 < N else s.P)
 
 
 @kernel
 def set_floor(floor: float, s: Scratch) -> None:
-    """The floor of the next pass."""
-    s.weighing[_FLOOR] = floor
+    """The floor of the next pass of a decision."""
+    s.floor[0] = floor
 
 
 @kernel
 def loses_more(allowed: float, inertial: bool, data: MpcData, s: Scratch, x: Array, u: Array) -> bool:
     """Whether a plan made with weights of the score is predicted to lose `allowed` more than its guess."""
-    if s.weighing[_FLOOR] >= COST_FLOOR:
+    if s.floor[0] >= COST_FLOOR:
         return False
     before = allowed * s.loss.shape[0]
     for i in range(s.loss.shape[0]):

@@ -74,7 +74,7 @@ def freeze_model(alpha: float, present: bool, sdre_weight: bool, data: MpcData, 
     hold_trim(s.A[:1], s.trim, s.c)
     for i in range(0 if present else s.c.shape[0]):
         hold_heading(s.r[i], s.x_0, s.A_c, data.dt, s.c[i])
-    if sdre_weight and solve_dare(s.A[0], s.B[0], data.Q[0], data.R, s.P, s.square) > 0:
+    if sdre_weight and solve_dare(s.A[0], s.B[0], data.Q[0], data.R[0], s.P, s.square) > 0:
         return True
     copy(data.P, s.P)
     return False
@@ -175,7 +175,7 @@ def _decide_rows(
                 stationary, pairs = False, N
             has_plan = memories[j, 0] > 0.0
             level, count = solve_within_model(
-                s.A[:pairs], s.B[:pairs], data.Q, s.P, stationary, s.r, has_plan, data, s, ws
+                s.A[:pairs], s.B[:pairs], data.Q, data.R, s.P, stationary, s.r, has_plan, data, s, ws
             )
             worst, iterations = max(worst, level), iterations + count
             if level > RELAXED or (at_need and not leaves_pair(ws.x)):
@@ -229,7 +229,7 @@ class SdcNmpc(Mpc):
         else:
             relinearise(ws.u, self.alpha, self._present, self._data, s)
             pairs = self.horizon
-        return Problem(s.A[:pairs], s.B[:pairs], self._data.Q, s.P, stationary, s.r)
+        return Problem(s.A[:pairs], s.B[:pairs], self._data.Q, self._data.R, s.P, stationary, s.r)
 
     def _accept(self, number: int, s: Scratch, ws: Workspace) -> bool:
         return number == self.relinearisations or (self._at_need and not leaves_pair(ws.x))

@@ -2,7 +2,7 @@
 
 With u = F - u_T, over u_0 .. u_{N-1} and with x_0 given:
 
-    minimise    1/2 [ sum_{i<N} |x_i - r_i|^2_Q_i + |u_i|^2_R + |u_i - u_{i-1}|^2_S  +  |x_N - r_N|^2_Qf ]
+    minimise    1/2 [ sum_{i<N} |x_i - r_i|^2_Q_i + |u_i|^2_R_i + |u_i - u_{i-1}|^2_S  +  |x_N - r_N|^2_Qf ]
                 + sum_k weight_k s_k
     subject to  x_{i+1} = A_i x_i + B_i u_i + c_i
                 lower <= u_i <= upper
@@ -46,7 +46,7 @@ class OcpQp(NamedTuple):
     B: Array  # (1 or N, 12, 4)
     c: Array  # (N, 12)
     Q: Array  # (1 or N, 12, 12), stages 0..N-1
-    R: Array  # (4, 4)
+    R: Array  # (1 or N, 4, 4); N of them beside R_rate want N pairs and N weights of the state, too
     Q_f: Array  # (12, 12)
     stationary: bool  # Q_f solves the DARE of the single (A, B) and Q: one gain serves all without R_rate
     x_0: Array  # (12,)
@@ -165,8 +165,9 @@ def condense(qp: OcpQp) -> Condensed:
         S[i + 1] = qp.A[j] @ S[i]
         S[i + 1, :, N_INPUT * i : N_INPUT * (i + 1)] += qp.B[j]
         f[i + 1] = qp.A[j] @ f[i] + qp.c[i]
-    H = np.asarray(np.kron(np.eye(N), qp.R), dtype=np.float64)
-    g = np.zeros(nv)
+    H, g = np.zeros((nv, nv)), np.zeros(nv)
+    for i, R in enumerate(np.broadcast_to(qp.R, (N, N_INPUT, N_INPUT))):
+        H[N_INPUT * i : N_INPUT * (i + 1), N_INPUT * i : N_INPUT * (i + 1)] = R
     if qp.R_rate is not None:
         change = np.eye(N) - np.eye(N, k=-1)
         H += np.kron(change.T @ change, qp.R_rate)
@@ -242,8 +243,9 @@ def validate(qp: OcpQp) -> None:
 
     Raises:
         ValueError: If a shape, type or layout is wrong, a number is not finite where it must be, bounds
-            cross, an index is out of range, a weight is not symmetric, R is not positive definite, or
-            `stationary` is claimed with more than one pair or more than one Q.
+            cross, an index is out of range, a weight is not symmetric, R is not positive definite,
+            `stationary` is claimed with more than one pair or weight, or R_rate stands beside an R of each
+            stage without a pair and Q of each stage.
     """
     N = len(qp.c)
     if N < 1:
@@ -253,7 +255,7 @@ def validate(qp: OcpQp) -> None:
     _require_array("B", qp.B, ((len(qp.A), n, m),))
     _require_array("c", qp.c, ((N, n),))
     _require_array("Q", qp.Q, ((1, n, n), (N, n, n)))
-    _require_array("R", qp.R, ((m, m),))
+    _require_array("R", qp.R, ((1, m, m), (N, m, m)))
     _require_array("Q_f", qp.Q_f, ((n, n),))
     _require_array("x_0", qp.x_0, ((n,),))
     _require_array("r", qp.r, ((N + 1, n),))
@@ -266,14 +268,14 @@ def validate(qp: OcpQp) -> None:
         _require_symmetric("R_rate", qp.R_rate)
     for name in ("Q", "R", "Q_f"):
         _require_symmetric(name, getattr(qp, name))
-    smallest = float(np.linalg.eigvalsh(qp.R)[0])
+    smallest = float(np.linalg.eigvalsh(qp.R).min())
     if smallest <= 0.0:
         raise ValueError(f"R must be positive definite, its smallest eigenvalue is {smallest}; raise it")
     if math.isnan(qp.rate_step) or qp.rate_step < 0.0:
         raise ValueError(f"rate_step must be >= 0 N per sample (inf for no limit), got {qp.rate_step}")
-    if qp.stationary and (len(qp.A) > 1 or len(qp.Q) > 1):
-        raise ValueError(
-            f"stationary needs one pair (A, B) and one Q, got {len(qp.A)} and {len(qp.Q)}; "
-            "set stationary=False"
-        )
+    weights = f"{len(qp.A)} pairs, {len(qp.Q)} Q and {len(qp.R)} R"
+    if qp.stationary and max(len(qp.A), len(qp.Q), len(qp.R)) > 1:
+        raise ValueError(f"stationary needs one pair (A, B), one Q and one R, got {weights}: set it to False")
+    if qp.R_rate is not None and len(qp.R) > 1 and not len(qp.A) == len(qp.Q) == N:
+        raise ValueError(f"R_rate and R of each stage need A, B and Q of each stage, got {weights}")
     _validate_rows(qp.rows, N)

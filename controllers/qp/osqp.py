@@ -136,13 +136,13 @@ def _state_weights(qp: OcpQp) -> Array:
 
 
 def _cost_values(qp: OcpQp) -> Array:
-    R = qp.R[np.triu_indices(N_INPUT)]
+    R = np.broadcast_to(qp.R, (len(qp.c), N_INPUT, N_INPUT))
     W = _state_weights(qp)[(slice(None), *np.triu_indices(N_STATE))]
-    inputs = np.tile(R, (len(W), 1))
+    inputs = R[(slice(None), *np.triu_indices(N_INPUT))]
     if qp.R_rate is None:
         return np.concatenate([inputs, W], axis=1).ravel()
     changes = np.r_[np.full(len(W) - 1, 2.0), 1.0]  # that u_i is part of
-    inputs += changes[:, None] * qp.R_rate[np.triu_indices(N_INPUT)]
+    inputs = inputs + changes[:, None] * qp.R_rate[np.triu_indices(N_INPUT)]
     between = np.tile(-qp.R_rate.ravel(), len(W) - 1)
     return np.concatenate([np.concatenate([inputs, W], axis=1).ravel(), between])
 

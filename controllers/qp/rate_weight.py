@@ -30,7 +30,7 @@ class RateWorkspace(NamedTuple):
     problem: Regulator  # of v, n = 16, R + S in the place of R; `stationary` is False
     feedback: Feedback  # of v; its D is that of u, too
     K_u: Array  # (N, 4, 16), gains of u
-    T: Array  # (4, 4)
+    T: Array  # (1 or N, 4, 4)
     v: Array  # (N, 4)
     z: Array  # (N+1, 16)
     wide: Array  # (2, 16, 4N)
@@ -41,7 +41,7 @@ def rate_size(horizon: int, n_models: int) -> int:
     """Numbers that `carve_rate` needs."""
     N, M, n, m = horizon, n_models, _SIZE, N_INPUT
     pairs, stages = M * (2 * n + 2 * m) * n, N * (n * n + 2 * m * n + 2 * n + m) + 2 * n * (N + 1)
-    return pairs + stages + n * n + 2 * m * m + n + 2 * n * m * N + RECURSION_SCRATCH * n * n
+    return pairs + stages + n * n + 2 * M * m * m + n + 2 * n * m * N + RECURSION_SCRATCH * n * n
 
 
 @kernel
@@ -62,7 +62,8 @@ def carve_rate(buffer: Array, qp: OcpQp, D: Array) -> RateWorkspace:
     i += stages.size
     points = take_blocks(buffer, i, 2, N + 1, n)
     i += points.size
-    small = take_blocks(buffer, i, 2, m, m)
+    E = qp.R.shape[0]
+    small = take_blocks(buffer, i, 2 * E, m, m)
     i += small.size
     v = take_blocks(buffer, i, 1, N, m)[0]
     i += v.size
@@ -71,9 +72,9 @@ def carve_rate(buffer: Array, qp: OcpQp, D: Array) -> RateWorkspace:
     wide = take_blocks(buffer, i, 2, n, m * N)
     i += wide.size
     scratch = take_blocks(buffer, i, RECURSION_SCRATCH, n, n)
-    problem = Regulator(A, B, stages[0], square[:W], small[0], square[W], False, x_0, points[0])
+    problem = Regulator(A, B, stages[0], square[:W], small[:E], square[W], False, x_0, points[0])
     feedback = Feedback(transposed, gains[:N], D, stages[1])
-    return RateWorkspace(problem, feedback, gains[N:], small[1], v, points[1], wide, scratch)
+    return RateWorkspace(problem, feedback, gains[N:], small[E:], v, points[1], wide, scratch)
 
 
 @kernel
@@ -116,10 +117,14 @@ def rate_pass(qp: OcpQp, w: RateWorkspace) -> None:
     """The problem over z into w, and its backward pass over matrices; R_rate is an array."""
     (N, n), m, z = qp.c.shape, N_INPUT, w.problem
     RT = w.scratch[0].reshape(-1)[: m * m].reshape(m, m)
-    _weigh_changes(qp.R, weight_of_changes(qp), z.R, w.T, RT)
-    for j in range(qp.A.shape[0]):
-        _augment_pair(qp.A[j], qp.B[j], w.T, z.A[j], z.B[j])
-    for i in range(qp.Q.shape[0]):
+    stages = w.T.shape[0]
+    for i in range(max(qp.A.shape[0], qp.Q.shape[0])):
+        if i < stages:
+            _weigh_changes(qp.R[i], weight_of_changes(qp), z.R[i], w.T[i], RT)
+        if i < qp.A.shape[0]:
+            _augment_pair(qp.A[i], qp.B[i], w.T[i if stages > 1 else 0], z.A[i], z.B[i])
+        if i >= qp.Q.shape[0]:
+            continue
         fill(z.Q[i], 0.0)
         copy(qp.Q[i], z.Q[i])
         for a in range(m):
@@ -138,7 +143,7 @@ def rate_pass(qp: OcpQp, w: RateWorkspace) -> None:
         copy(w.feedback.K[i], w.K_u[i])
         for a in range(m):
             for b in range(m):
-                w.K_u[i, a, n + b] -= w.T[a, b]
+                w.K_u[i, a, n + b] -= w.T[i if stages > 1 else 0, a, b]
 
 
 @kernel

@@ -26,7 +26,7 @@ class Regulator(NamedTuple):
     B: Array  # (1 or N, n, 4)
     c: Array  # (N, n)
     Q: Array  # (1 or N, n, n)
-    R: Array  # (4, 4)
+    R: Array  # (1 or N, 4, 4)
     Q_f: Array  # (n, n)
     stationary: bool  # Q_f solves the DARE of the single pair: every stage has the gain of the first
     x_0: Array  # (n,)
@@ -115,14 +115,14 @@ def riccati_pass(problem: Regulator, feedback: Feedback, scratch: Array) -> None
         transpose(A[j], transposed[j, :n])
         transpose(B[j], transposed[j, n:])
     if problem.stationary:
-        stage_gains(P, A[0], B[0], R, K[0], D[0], work)
+        stage_gains(P, A[0], B[0], R[0], K[0], D[0], work)
     for i in range(N - 1, -1, -1):
         for a in range(n):
             P_c[i, a] = 0.0
         add_matvec_transposed(P, c[i], 1.0, P_c[i])
         if not problem.stationary:
             j = i if A.shape[0] > 1 else 0
-            stage_gains(P, A[j], B[j], R, K[i], D[i], work)
+            stage_gains(P, A[j], B[j], R[i if R.shape[0] > 1 else 0], K[i], D[i], work)
             if i > 0:
                 Q_i = Q[i if Q.shape[0] > 1 else 0]
                 _step_cost_to_go(A[j], Q_i, work[0], work[1, :N_INPUT], work[2, :N_INPUT], work[3], P)

@@ -112,7 +112,7 @@ def _gradient(qp: OcpQp, u: Array, x: Array, pull: Array) -> Array:
     gradient = np.empty((N, N_INPUT))
     for i in range(N - 1, -1, -1):
         j = i if len(qp.A) > 1 else 0
-        gradient[i] = qp.R @ u[i] + qp.B[j].T @ costate
+        gradient[i] = qp.R[i if len(qp.R) > 1 else 0] @ u[i] + qp.B[j].T @ costate
         if qp.R_rate is not None:
             gradient[i] += qp.R_rate @ (u[i] - (u[i - 1] if i else qp.u_last))
             if i + 1 < N:

@@ -29,7 +29,7 @@ def is_mild(A: Array, R: Array, Q_f: Array, horizon: int, scratch: Array) -> boo
 
     Args:
         A: (1 or N, 12, 12).
-        R: (4, 4).
+        R: (1 or N, 4, 4).
         Q_f: (12, 12), the largest weight of a state.
         horizon: N.
         scratch: Overwritten, (>= 2, 12).
@@ -52,8 +52,9 @@ def is_mild(A: Array, R: Array, Q_f: Array, horizon: int, scratch: Array) -> boo
     largest, smallest = 0.0, math.inf
     for a in range(n):
         largest = max(largest, Q_f[a, a])
-    for a in range(R.shape[0]):
-        smallest = min(smallest, R[a, a])
+    for i in range(R.shape[0]):
+        for a in range(R.shape[1]):
+            smallest = min(smallest, R[i, a, a])
     return growth * growth * max(largest, smallest) <= _MILD * smallest
 
 
@@ -109,7 +110,7 @@ def lagrangian_gradient(
     gradient: Array,
     scratch: Array,
 ) -> float:
-    """Gradient in u of cost - sum lambda (a'u - b), by the costate: `g_i = R u_i + B_i' y_{i+1} - pulls`.
+    """Gradient in u of cost - sum lambda (a'u - b), by the costate: `g_i = R_i u_i + B_i' y_{i+1} - pulls`.
 
     Args:
         qp: The problem; R_rate is an array, (0, 4) where changes have no weight.
@@ -123,7 +124,7 @@ def lagrangian_gradient(
         scratch: Overwritten, (>= 3, 12).
 
     Returns:
-        Its largest entry over 1 + the largest entry of its terms R u_i, B_i' y_{i+1} and S (u_i - u_{i-1}).
+        Its largest entry over 1 + the largest entry of its terms R_i u_i, B_i' y_{i+1} and S (u_i - u_{i-1}).
     """
     A, B, Q, R, r, R_rate = qp.A, qp.B, qp.Q, qp.R, qp.r, weight_of_changes(qp)
     N, m = u.shape
@@ -145,11 +146,12 @@ def lagrangian_gradient(
         add_matvec_transposed(B[i - 1 if B.shape[0] > 1 else 0], y, 1.0, block)
     scale, worst = 1.0, 0.0
     for i in range(N):
+        own_weight = R[i if R.shape[0] > 1 else 0]
         for a in range(m):
             k = m * i + a
             own = 0.0
             for b in range(m):
-                own += R[a, b] * u[i, b]
+                own += own_weight[a, b] * u[i, b]
             scale = max(scale, 1.0 + abs(own), 1.0 + abs(gradient[k]))
             if R_rate.shape[0] > 0:
                 before, after = _pull_of_changes(R_rate, qp.u_last, u, i, a)

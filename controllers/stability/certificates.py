@@ -173,8 +173,8 @@ def plan_cost(qp: OcpQp, u: Array, x: Array) -> float:
     """
     N = len(u)
     e = x - qp.r
-    Q = qp.Q if len(qp.Q) > 1 else np.broadcast_to(qp.Q, (N, *qp.Q.shape[1:]))
-    cost = np.einsum("ia,iab,ib", e[:N], Q, e[:N]) + np.einsum("ia,ab,ib", u, qp.R, u) + e[N] @ qp.Q_f @ e[N]
+    Q, R = (np.broadcast_to(weight, (N, *weight.shape[1:])) for weight in (qp.Q, qp.R))
+    cost = np.einsum("ia,iab,ib", e[:N], Q, e[:N]) + np.einsum("ia,iab,ib", u, R, u) + e[N] @ qp.Q_f @ e[N]
     if qp.R_rate is not None:
         change = np.diff(u, axis=0, prepend=qp.u_last[None])
         cost += np.einsum("ia,ab,ib", change, qp.R_rate, change)
@@ -190,7 +190,7 @@ def plan_cost(qp: OcpQp, u: Array, x: Array) -> float:
 def stage_cost(qp: OcpQp, u: Array) -> float:
     """|x_0 - r_0|_Q^2 + |u|_R^2 of the first sample of a problem."""
     e = qp.x_0 - qp.r[0]
-    return float(e @ qp.Q[0] @ e + u @ qp.R @ u)
+    return float(e @ qp.Q[0] @ e + u @ qp.R[0] @ u)
 
 
 def predicted_state(qp: OcpQp, u: Array) -> Array:

@@ -219,7 +219,9 @@ def decide_team(
     for j in range(commands.shape[0]):
         H, K = pose_row(team, j, which, consensus, avoidance, layout, data, s, work)
         plant, memory = team[_PLANT][j], team[_MEMORY][j]
-        level, iterations = solve_row(s.A, s.B, data.Q, s.P, False, s.r, memory[0] > 0.0, H, K, data, s, ws)
+        level, iterations = solve_row(
+            s.A, s.B, data.Q, data.R, s.P, False, s.r, memory[0] > 0.0, H, K, data, s, ws
+        )
         end_row(
             level, plant, team[_LAST][j], team[_DISTURBANCE][j], memory, data, s, ws.u, commands[j], kept[j]
         )
