@@ -1,9 +1,9 @@
-"""Environment speed: `python -m benchmarks.step [--seconds 1] [--json]`.
+"""Environment speed: `python -m benchmarks.step [--seconds 1] [--beside CHECKOUT] [--json]`.
 
 Control steps, physics substeps and simulated seconds per second, for one environment through `gymnasium.make`
 with its default wrappers, for the bare compiled step, and for vector environments; l2f beside them in the
 same run when it is installed. Rewards, limits, observations with preview and autoreset are included
-everywhere but in "bare" and in l2f.
+everywhere but in "bare" and in l2f. With `--beside` CPU time of steps here and in another checkout, in turns.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import importlib.util
 import json
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from .timing import machine, one_thread, rates
@@ -25,6 +26,8 @@ import numpy as np  # noqa: E402
 
 import quad_envs  # noqa: E402, F401
 from baselines.evaluation.table import format_table  # noqa: E402
+
+from .steps_beside import steps_beside  # noqa: E402
 
 _ID = "quad/HelixTracking-v0"
 _STEPS = 1000  # control steps of a single environment in one call
@@ -48,7 +51,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {
     "sensor noise": {"sensor_noise": 0.01},
     "random vehicles": {"randomize": 0.1},
     "all limits": _LIMITS,
-    "reset in the same step": {"autoreset_mode": gym.vector.AutoresetMode.SAME_STEP},
+    "reset in the same step": {"autoreset_mode": gym.vector.AutoresetMode.SAME_STEP.value},
     "everything": {
         "env_id": "quad/RandomTracking-v0",
         "reveal_disturbance": True,
@@ -192,12 +195,42 @@ def ratios(found: dict[str, dict[str, float]]) -> dict[str, float]:
     return out
 
 
+def _compare(other: Path, repetitions: int, as_json: bool) -> None:
+    """Print steps of this checkout beside those of another one."""
+    found = steps_beside(other, _OPTIONS, _ROWS, _EPISODE, repetitions)
+    if as_json:
+        json.dump({name: pair._asdict() for name, pair in found.items()}, sys.stdout, indent=2)
+        print()
+        return
+    plain = found[f"{_ROWS} with nothing"]
+    rows = [
+        [
+            name,
+            f"{here:.0f}",
+            f"{there:.0f}",
+            f"{there / here:.2f}",
+            f"{plain.here / here:.2f}",
+            f"{plain.there / there:.2f}",
+        ]
+        for name, (here, there) in found.items()
+    ]
+    heads = ["CPU-ns of a row's step", "here", "there", "times faster", "plain / here", "plain / there"]
+    print(format_table(heads, rows))
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.step", description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=1.0, help="time for each measurement (default 1)")
     parser.add_argument("--json", action="store_true", help="machine-readable")
+    parser.add_argument(
+        "--beside", type=Path, help="another checkout, whose steps are flown in turns with ours"
+    )
+    parser.add_argument("--repetitions", type=int, default=5, help="of these turns (default 5)")
     arguments = parser.parse_args()
+    if arguments.beside:
+        _compare(arguments.beside, arguments.repetitions, arguments.json)
+        return
     found = measure(arguments.seconds)
     if arguments.json:
         json.dump({"machine": machine(), "rates": found, "ratios": ratios(found)}, sys.stdout, indent=2)
