@@ -67,11 +67,10 @@ def draw_ahead(
         noises: Tables, (n, 1, 12): the present errors where there are some.
         which: Its tables of both.
     """
-    drawn = draws.drawn[block]
     if draws.gusty:
-        blow(disturbances[which[0], 0], draws.keys[i], step, draws.keep, draws.sizes, drawn)
+        blow(disturbances[which[0], 0], draws.keys[i], step, draws.keep, draws.sizes, draws.drawn[block])
     if draws.noisy:
-        errors = noises[which[1], 0]
+        errors, drawn = noises[which[1], 0], draws.drawn[block]
         draw(draws.keys[i], step, _ERRORS, drawn[:_ERROR_NUMBERS])
         for c in range(N_STATE):
             errors[c] = draws.deviations[c] * drawn[c]

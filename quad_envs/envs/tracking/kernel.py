@@ -315,8 +315,9 @@ def tell(w: Array, j: Int, i: int, flights: Flights, out: NDArray[np.float32], t
 @inline_kernel
 def foresee(w: Array, j: Int, i: int, flights: Flights) -> None:
     """Draw what vehicle i, which is in lane j, meets after the present step."""
-    tables = flights.disturbances, flights.noises
-    draw_ahead(flights.draws, i, i // LANES, int(w[STEP + j]), *tables, flights.which[1:, i])
+    if flights.draws.gusty or flights.draws.noisy:
+        tables = flights.disturbances, flights.noises
+        draw_ahead(flights.draws, i, i // LANES, int(w[STEP + j]), *tables, flights.which[1:, i])
 
 
 @inline_kernel
