@@ -46,9 +46,10 @@ from ...lanes import (
 )
 from ...observations.team import N_PLAN_STAGE
 from ...plant import N_INPUT, Array
+from ..shared.actions import first_unsound
 from ..shared.draws import Draws, draw_ahead
 from ..shared.task_vector import DT, HOVER, SUBSTEPS
-from ..tracking.kernel import begin_lane, command, first_unsound, substep
+from ..tracking.kernel import begin_lane, command, substep
 from .exchange import (
     DISTURBANCE,
     DRAW,

@@ -102,10 +102,7 @@ class TrackingBatch(PackedBatch):
         if self._disturbance is not None and not random[1]:
             self.disturbances[0] = disturbance_rows(self._disturbance, self._nodes, dt, never)
         self._random = random
-        self.which: NDArray[np.int64] = np.zeros((3, n), dtype=np.int64)
-        for table in range(3):
-            if random[table]:
-                self.which[table] = np.arange(n)
+        self.which: NDArray[np.int64] = np.outer(random, np.arange(n))  # a table of each, or the one of all
         self._place_nominal()
         self._arrays = Flights(
             self.vehicles.array,

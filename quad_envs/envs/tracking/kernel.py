@@ -59,6 +59,7 @@ from ...plant import N_INPUT, N_STATE, Array
 from ...reward import stage_cost_parts
 from ...table_row import N_PREVIEW, N_TABLE
 from ...tasks import CRASH_CAUSES
+from ..shared.actions import first_unsound
 from ..shared.draws import Draws, draw_ahead
 from ..shared.task_vector import (
     ACTION_MAX,
@@ -378,19 +379,6 @@ def fly(w: Array, lanes: int, first: int, disturbances: Array, which: IntArray, 
     for s in range(int(task[SUBSTEPS])):
         substep(w, s, lanes, first, disturbances, which, task)
     arrive(w)
-
-
-@kernel
-def first_unsound(actions: NDArray[np.float32]) -> int:
-    """Index of the first action that is not a finite number; -1 if all are."""
-    sound = True
-    for a in range(actions.size):
-        sound &= abs(actions[a]) < np.inf
-    if not sound:
-        for a in range(actions.size):
-            if not np.isfinite(actions[a]):
-                return a
-    return -1
 
 
 @lane_kernel
