@@ -7,7 +7,7 @@ import pytest
 from baselines import make_policy, shipped_policies
 from baselines.policies.trained import SHIPPED, shipped_name
 from baselines.training.shipping import judged
-from quad_envs.registration import TRACKING
+from quad_envs.registration import TEAMS, TRACKING
 
 NAMES = sorted(shipped_policies())
 
@@ -30,6 +30,15 @@ def test_a_shipped_policy_is_small_and_says_what_made_it(name):
 
 def test_a_policy_for_several_tasks_stands_for_none_of_them():
     assert shipped_name("apg", "quad/RandomTracking-v0") == "apg-random"
+
+
+def test_scores_of_teams_are_of_many_independent_teams_and_say_their_interval():
+    told = [json.loads((SHIPPED / name / "policy.json").read_text()) for name in NAMES]
+    teams = [said for said in told if said["env_id"] in TEAMS]
+    assert {said["algorithm"] for said in teams} == {"apg", "dagger"}
+    for said in teams:
+        assert said["starts"]["teams"] >= 100 and 0.0 < said["score_half_width"] < 0.05
+        assert said["crashes"] == 0 and said["min_separation"] > 0.4
 
 
 @pytest.mark.slow
