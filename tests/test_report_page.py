@@ -1,4 +1,5 @@
 """The report in a browser, headless Chromium: it plays, scrubs, sorts, compares, and loads nothing."""
+# ruff: noqa: F811  fixtures of another file
 
 from __future__ import annotations
 
@@ -10,6 +11,7 @@ from importlib import resources
 
 import numpy as np
 import pytest
+from pages import browser, show, until  # noqa: F401
 
 from baselines import run_benchmark
 from baselines.report import Choice, render_report
@@ -18,16 +20,6 @@ from baselines.sweeps.store import cells_of
 
 pytestmark = pytest.mark.slow
 
-playwright = pytest.importorskip("playwright.sync_api", reason="needs the playwright package")
-
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-FLAGS = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 HELIX, CORRIDOR, TEAM = "quad/HelixTracking-v0", "quad/CorridorTracking-v0", "a team"
 EVIL = "</script><img src=x onerror=alert(1)>"
 SUITE = {
@@ -56,50 +48,6 @@ def folder(tmp_path_factory):
     return found
 
 
-@pytest.fixture(scope="module")
-def browser():
-    path = next((found for name in BROWSERS if (found := shutil.which(name))), None)
-    if path is None:
-        pytest.skip("needs Chromium")
-    with playwright.sync_playwright() as running:
-        chromium = running.chromium.launch(executable_path=path, args=FLAGS)
-        yield chromium
-        chromium.close()
-
-
-@pytest.fixture
-def show(browser, folder):
-    """Opens a page file; at the end nothing was complained of and nothing was asked for."""
-    trouble, asked, contexts = [], [], []
-
-    def opened(path=folder / "report.html", width=1440, height=1000, still=True, **settings):
-        if still:
-            settings["reduced_motion"] = "reduce"
-        context = browser.new_context(viewport={"width": width, "height": height}, **settings)
-        contexts.append(context)
-        page = context.new_page()
-        page.set_default_timeout(15_000)
-        page.on("console", lambda said: trouble.append(f"{said.type}: {said.text}"))
-        page.on("pageerror", lambda error: trouble.append(str(error)))
-        page.on("dialog", lambda dialog: trouble.append(f"dialog: {dialog.message}"))
-        page.on("request", lambda request: asked.append(request.url))
-        page.goto(path.as_uri())
-        page.wait_for_selector(".plot")
-        if still:  # the whole flight from its beginning, and not the moment on which a page opens
-            page.locator("#reset").click()
-            page.keyboard.press("Home")
-            page.evaluate("document.activeElement.blur()")
-        return page
-
-    yield opened
-    for context in contexts:
-        context.close()
-    ours = "willReadFrequently"  # advice to `ink`, which reads the canvas
-    assert [said for said in trouble if ours not in said] == []
-    assert {url.split(":")[0] for url in asked} <= {"file", "data"}
-    assert all(url.endswith(".html") for url in asked if url.startswith("file:"))
-
-
 def ink(page, selector="#panes canvas"):
     """Number of painted pixels of the first canvas, and a sum that changes with the picture."""
     return page.evaluate(
@@ -115,15 +63,6 @@ def ink(page, selector="#panes canvas"):
         }""",
         selector,
     )
-
-
-def until(page, condition):
-    """Wait for a condition; Playwright's own way evaluates text in the page, which its policy forbids."""
-    for _ in range(300):
-        if page.evaluate(condition):
-            return
-        page.wait_for_timeout(50)
-    raise AssertionError(f"never came true: {condition}")
 
 
 def clock(page):
