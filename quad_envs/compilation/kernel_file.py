@@ -4,7 +4,7 @@ Numba itself loads a kernel as if it were about to compile: it imports every fun
 SciPy, for linear algebra) and prepares its runtime, which takes most of a warm start. Machine code needs none
 of it, only the C functions that it calls. They are listed with it; where one is not there, numba is prepared
 in full, and where it is still not there, the bytes are of no use here. Separate kernels that it calls (see
-`separate`) are listed apart, since they are found in files.
+`separate`) are listed with the names of their files.
 """
 
 from __future__ import annotations
@@ -51,14 +51,13 @@ def pack(compiled: Any) -> bytes:
     (name, kind, (code, _)), descriptor, *rest = compiled._reduce()
     module = compiled.library._final_module
     needed = [
-        symbol.name
+        (symbol.name, _NAMES[symbol.name]) if symbol.name in _NAMES else symbol.name
         for symbols in (module.functions, module.global_variables)
         for symbol in symbols
         if symbol.is_declaration and not symbol.name.startswith("llvm.")
     ]
     library = name, kind, (code, _names_alone(descriptor))
-    separate = [_NAMES[symbol] for symbol in needed if symbol in _NAMES]
-    return bytes(serialize.dumps((separate, needed, library, descriptor, *rest)))
+    return bytes(serialize.dumps((needed, library, descriptor, *rest)))
 
 
 def unpack(raw: bytes, target: Any, load: Callable[[str], None]) -> Any:
@@ -72,11 +71,13 @@ def unpack(raw: bytes, target: Any, load: Callable[[str], None]) -> Any:
     Raises:
         ValueError: If the kernel calls what is not there.
     """
-    separate, needed, library, *rest = _Unpickler(io.BytesIO(raw)).load()
+    calls, library, *rest = _Unpickler(io.BytesIO(raw)).load()
     _publish_runtime()
-    for name in separate:
+    separate: dict[str, str] = dict(call for call in calls if isinstance(call, tuple))
+    for name in separate.values():
         if name not in _SEPARATE:
             load(name)
+    needed = [*separate, *(call for call in calls if isinstance(call, str))]
     if _missing(needed):
         target.refresh()
         if _missing(needed):
