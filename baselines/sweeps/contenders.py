@@ -18,7 +18,7 @@ from ..evaluation.column import COUNTED, LESS, MORE, TEAM, Column
 from ..evaluation.columns import COLUMNS, limits_in, shown
 from ..evaluation.evaluate import Evaluation
 from ..evaluation.metrics import summarize, totals, worst_violations
-from ..evaluation.statistics import Comparison, Interval, compare, mean_interval
+from ..evaluation.statistics import Comparison, Interval, compare, difference, mean_interval
 from ..evaluation.table import Table, printed_table
 from ..evaluation.team_metrics import flight_values
 from ..policies.registry import behind_filter, from_outside, is_mpc
@@ -107,12 +107,16 @@ class Contender(NamedTuple):
         """See `rank_of`."""
         return rank_of(self.evaluations)
 
-    def beside(self, base: Contender, column: str = "score") -> Comparison | None:
-        """This beside another in the same environment; None where a crash left no number."""
-        ours, theirs = self.values(column), base.values(column)
+    def beside(self, base: Contender) -> Comparison:
+        """The scores of this beside those of another in the same environment."""
+        return compare([self.values("score")], [base.values("score")])
+
+    def dearer(self, base: Contender) -> Interval | None:
+        """By how much quadratic cost it is dearer than another; None where a crash left no number."""
+        ours, theirs = self.values("quadratic_cost"), base.values("quadratic_cost")
         if not (np.isfinite(ours).all() and np.isfinite(theirs).all()):
             return None
-        return compare([ours], [theirs])
+        return difference([ours], [theirs])
 
 
 def find_contenders(
@@ -206,8 +210,7 @@ def contender_rows(
             row |= _compared(one.beside(rival))
             row |= _spread("score", mean_interval(one.values("score")))
             row |= _spread("quadratic_cost", mean_interval(one.values("quadratic_cost")))
-            cost = one.beside(rival, "quadratic_cost")
-            row |= _spread(_COST.name, None if cost is None else cost.difference)
+            row |= _spread(_COST.name, one.dearer(rival))
             rows.append(row)
         rows += [{"table": table, **row} for row in _over_all(here, rivals, base)]
     return rows
