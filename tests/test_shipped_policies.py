@@ -2,10 +2,12 @@
 
 import json
 
+import gymnasium
 import pytest
 
-from baselines import make_policy, shipped_policies
+from baselines import evaluate, make_policy, shipped_policies
 from baselines.policies.trained import SHIPPED, shipped_name
+from baselines.training.held_out import CHOOSING
 from baselines.training.shipping import judged
 from quad_envs.registration import TEAMS, TRACKING
 
@@ -50,6 +52,16 @@ def test_a_shipped_policy_has_its_recorded_score(name):
     assert found.score == pytest.approx(said["score"], abs=1e-4)
     assert found.violation_share == pytest.approx(said["violation_share"], abs=1e-3)
     assert found.crashes == said["crashes"]
+
+
+def test_the_generalist_flies_all_tracking_ids_other_references_and_under_a_filter():
+    ids = [env_id for env_id in TRACKING if env_id != "quad/CorridorTracking-v0"]
+    for env_id in ids:
+        assert evaluate("apg-generalist", env_id, 3, CHOOSING).summary()["score"].mean > 0.7, env_id
+    racetrack = gymnasium.make(ids[0], reference="racetrack", disturbance="gusts")
+    assert not any(record.crashed for record in evaluate("apg-generalist", racetrack, 3, CHOOSING).records)
+    kept = evaluate("safe:apg-generalist", "quad/CorridorTracking-v0", 1, CHOOSING)
+    assert kept.records[0].violation_share == 0.0
 
 
 def test_a_shipped_policy_flies_by_its_name_without_torch(monkeypatch):

@@ -1,9 +1,9 @@
 """Shipped policies: `python -m baselines.training.shipping RUN ...` copies networks of runs into the suite.
 
-`--best NAME` copies one of them: the best on starts that choose, under the name NAME. A shipped policy is a
-checkpoint with the command, seed, versions and revision that made it, its learning curve, and its score on
-starts that neither training nor the choice of the best network has seen: of a team on as many as choose among
-runs, with the interval over whole teams, since five teams are few and their vehicles are not independent.
+`--best NAME` copies one of them, that crashes least and then scores most on starts that choose, as NAME. A
+shipped policy is a checkpoint with the command, seed, versions and revision that made it, its learning curve,
+and its score on starts that neither training nor the choice of the best network has seen: of a team on many,
+with the interval over whole teams, since five teams are few and their vehicles are not independent.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from ..policies.network_policies import network_policy
 from ..policies.trained import SHIPPED, name_for
 from .held_out import CHOOSING, HELD_OUT, HeldOutFlights, Point, Progress
 
-_MANY_FLIGHTS = 100  # that choose among runs, or tell of a team; while training fewer choose
+_CHOOSING_FLIGHTS = 500  # among runs; while training fewer choose among the networks of one
+_MANY_FLIGHTS = 100  # that tell of a team
 _SAID = (
     *("env_id", "env_kwargs", "mission", "algorithm", "kind", "seed", "hyperparameters", "made_by", "budget"),
     *("cpu_seconds", "steps", "updates"),
@@ -61,8 +62,13 @@ def score_of_teams(network_folder: Path, teams: int = _MANY_FLIGHTS) -> dict[str
 
 
 def best_of(runs: Sequence[Path]) -> Path:
-    """The run whose network has the highest score on _MANY_FLIGHTS starts that choose."""
-    return max(runs, key=lambda run: judged(run, CHOOSING, _MANY_FLIGHTS).score)
+    """The run whose network crashes least, then scores most, on _CHOOSING_FLIGHTS starts that choose."""
+
+    def rank(run: Path) -> tuple[int, float]:
+        point = judged(run, CHOOSING, _CHOOSING_FLIGHTS)
+        return point.crashes, -point.score
+
+    return min(runs, key=rank)
 
 
 def ship(run: Path, name: str = "") -> Path:
