@@ -17,6 +17,7 @@ from quad_envs.encoding import hover_actions
 from quad_envs.observations.features import default_features
 
 HELIX, RANDOM, FORMATION = "quad/HelixTracking-v0", "quad/RandomTracking-v0", "quad/Formation-v0"
+TARGET = "quad/TargetTracking-v0"
 
 
 def still(task, outputs=4):
@@ -210,6 +211,21 @@ def test_a_team_or_a_start_that_does_not_fit_is_refused_before_anything_is_writt
         train(
             FORMATION, "apg", env_kwargs=given, start_from=start or "dagger-formation", steps=1, out=tmp_path
         )
+    assert not (tmp_path / "config.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("env_id", "given", "message"),
+    [
+        (HELIX, {"hyper": {"expert": "nmcp"}}, "did you mean 'nmpc'"),
+        (HELIX, {"hyper": {"episode_steps": 20}}, "episode_steps = 20 is for teams"),
+        (HELIX, {"start_from": "dagger-random", "hyper": {"net_arch": [8]}}, "give the same net_arch"),
+        (TARGET, {"start_from": "dagger-formation"}, r"sees rows 0, 2, 5 of 'preview'.*give the same stages"),
+    ],
+)
+def test_what_dagger_cannot_do_is_refused_before_anything_is_written(tmp_path, env_id, given, message):
+    with pytest.raises(ValueError, match=message):
+        train(env_id, "dagger", steps=1, out=tmp_path, **given)
     assert not (tmp_path / "config.json").exists()
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
@@ -96,7 +96,7 @@ class EstimateVectorWrapper(VectorEnv[Observations, NDArray[np.float32], NDArray
         """A step of the teams, then one of the filters."""
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         rows = np.arange(self.num_envs)
-        if self.metadata["autoreset_mode"].value == "NextStep":
+        if self.env.autoreset_mode is AutoresetMode.NEXT_STEP:
             self.filters.begin(rows[np.repeat(self._done, self.task.vehicles)])
         self._done = np.asarray((terminated | truncated).reshape(self.num_teams, -1).all(axis=1))
         known = self.filters.step(rows, observations)

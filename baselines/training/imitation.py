@@ -28,7 +28,8 @@ from ..policies.network_policies import network_policy
 from ..policies.protocol import Policy
 from ..policies.registry import is_trained, make_policy, policy_options
 from .algorithm_options import DaggerOptions
-from .features import training_features
+from .beginning import require_continuable
+from .features import require_measured, training_features
 from .held_out import Progress
 from .observer import Observer
 from .policy_gradient import Actor
@@ -173,6 +174,30 @@ def make_expert(
     return expert
 
 
+def check(
+    task_options: TrackingOptions | TeamOptions, options: DaggerOptions, start: Network | None = None
+) -> None:
+    """Refuse what `train` would, before anything is written.
+
+    Raises:
+        ValueError: If the expert is not allowed, nobody measures a target, a hyperparameter is for teams, or
+            training cannot go on from `start`.
+    """
+    task = task_options.task
+    make_expert(options.expert, task, options.separation, options.disturbance_estimate)
+    if isinstance(task_options, TeamOptions):
+        require_measured(task_options)
+    elif options.episode_steps is not None:
+        raise ValueError(
+            f"hyperparameter episode_steps = {options.episode_steps!r} is for teams: leave it out"
+        )
+    if start is not None:
+        sees = options.disturbance_estimate, options.heading_axes
+        features = training_features(task_options, options.stages, *sees)
+        outputs = task.action_size if isinstance(task, TeamTask) else 4
+        require_continuable(start, features, options.net_arch, outputs, options.squash)
+
+
 def train(
     task_options: TrackingOptions | TeamOptions,
     options: DaggerOptions,
@@ -197,11 +222,8 @@ def train(
 
     torch.manual_seed(seed)
     expert = make_expert(options.expert, task_options.task, options.separation, options.disturbance_estimate)
-    if options.episode_steps is not None:
-        if not isinstance(task_options, TeamOptions):
-            raise ValueError(
-                f"hyperparameter episode_steps = {options.episode_steps!r} is for teams: leave it out"
-            )
+    check(task_options, options)
+    if isinstance(task_options, TeamOptions) and options.episode_steps is not None:
         task_options = replace(task_options, max_cycles=options.episode_steps)
     flights = LabelledFlights(
         task_options,
