@@ -343,6 +343,18 @@ def test_kernels_found_again_need_no_compiler_and_others_compile_beside_them(tmp
     assert mixed == warm + "3.0\n"
 
 
+def test_kernels_are_compiled_where_no_c_compiler_can_be_found(tmp_path):
+    script, empty = tmp_path / "everything.py", tmp_path / "empty"
+    script.write_text(EVERYTHING)
+    empty.mkdir()
+    environment = {key: value for key, value in os.environ.items() if key not in ("CC", "CXX")}
+    environment |= {"NUMBA_CACHE_DIR": str(tmp_path), "PATH": str(empty)}
+    done = subprocess.run(
+        [sys.executable, str(script)], env=environment, capture_output=True, text=True, check=True
+    )
+    assert "Pair(table" in done.stdout and list((tmp_path / "quad-envs").glob("*.nbc"))
+
+
 def test_two_processes_that_compile_at_once_leave_whole_files(tmp_path):
     script = tmp_path / "everything.py"
     script.write_text(EVERYTHING)
