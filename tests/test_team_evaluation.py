@@ -352,7 +352,7 @@ def test_a_suite_of_both_kinds_of_ids_leaves_its_folder(tmp_path):
     header, *rows = (tmp_path / "results.csv").read_text().splitlines()
     assert "agent" in header.split(",") and len(rows) == 2 * (2 * 6 + 2 * 6 + 2 * 4 + 2)
     assert len(list((tmp_path / "episodes").iterdir())) == 16
-    with np.load(next((tmp_path / "episodes").glob("000-*-0.npz"))) as arrays:
+    with np.load(tmp_path / "episodes" / suite_units(results.suite)[0].episode_name(0)) as arrays:
         assert arrays["states"].shape == (6, 21, 16) and arrays["agent"].tolist()[5] == "quad_5"
         assert arrays["min_separation"].shape == (6, 20) and arrays["lengths"].tolist() == 6 * [20]
     again = run_benchmark(SUITE, tmp_path, save_episodes=True)
