@@ -64,12 +64,7 @@ class TrackingBatch(PackedBatch):
         self.options, self.n, self.task = options, n, options.task
         self._reference: Reference = make_reference(options.reference)
         self._disturbance: Disturbance | None = options.make_disturbance()
-        # A table that is the same in every episode is stored once.
-        random = (
-            self._reference.random,
-            self._disturbance is not None and self._disturbance.random,
-            max(self.task.sensor_noise) > 0.0,
-        )
+        random = self._random = self._drawn_anew()
         count = [n if is_random else 1 for is_random in random]
         steps, dt, nodes = self.task.episode_steps, self.task.dt, 2 * options.substeps + 1
         references = (count[0], steps + 1 + self.task.layout.preview, N_TABLE)
@@ -101,7 +96,6 @@ class TrackingBatch(PackedBatch):
             _tabulate_previews(self.references, np.zeros(1, dtype=np.int64), self._previews)
         if self._disturbance is not None and not random[1]:
             self.disturbances[0] = disturbance_rows(self._disturbance, self._nodes, dt, never)
-        self._random = random
         self.which: NDArray[np.int64] = np.outer(random, np.arange(n))  # a table of each, or the one of all
         self._place_nominal()
         self._arrays = Flights(
@@ -120,6 +114,14 @@ class TrackingBatch(PackedBatch):
         self._blocks = self.vehicles.count
         threads = min(threads, self._blocks)
         self._threads = Threads(threads) if threads > 1 else None
+
+    def _drawn_anew(self) -> tuple[bool, bool, bool]:
+        """Whether references, disturbances and noise differ from episode to episode.
+
+        A table that is the same in every episode is stored once.
+        """
+        blown = self._disturbance is not None and self._disturbance.random
+        return self._reference.random, blown, max(self.task.sensor_noise) > 0.0
 
     def _uniform_numbers(self) -> _Drawn:
         """What the flights of this task draw."""
