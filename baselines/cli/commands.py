@@ -248,7 +248,8 @@ def benchmark_suite(options: BenchmarkOptions) -> int:
         try:
             results = fly_suite(suite, {}, out, order)
         except KeyboardInterrupt as interruption:
-            say(f"interrupted; {max(finished, 0)} units are stored. Resume with: {_resume(options, out)}")
+            said = f"interrupted; what was flown is stored, {max(finished, 0)} units whole"
+            say(f"{said}. Resume with: {_resume(options, out)}")
             return exit_code(interruption)
         finally:
             watcher.close()

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quad_envs.names import shown, unknown_name
-from quad_envs.sensors import DEFAULT_SENSOR
-from quad_envs.tasks import TeamTask
 
 from ..errors import CheckpointError
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # not at run time: tasks load numba, and `quad-envs list` has to be quick
+    from quad_envs.tasks import TeamTask
+
     from .network import NetworkPolicy
     from .network_policies import EstimatingPolicy
 
@@ -97,6 +97,8 @@ def load_policy(source: str | os.PathLike[str], env: Any) -> NetworkPolicy | Est
     Raises:
         CheckpointError: If it is no checkpoint of this version, or was trained on another kind of task.
     """
+    from quad_envs.tasks import TeamTask
+
     from .checkpoints import load_checkpoint
     from .environments import task_of
     from .network_policies import network_policy
@@ -125,6 +127,8 @@ def _require_sensor(where: str, said: Mapping[str, Any], task: TeamTask) -> None
     Raises:
         CheckpointError: If it was another one.
     """
+    from quad_envs.sensors import DEFAULT_SENSOR
+
     given = said.get("env_kwargs", {})
     trained = given.get("sensor", DEFAULT_SENSOR) if isinstance(given, Mapping) else task.sensor
     if trained != task.sensor:
