@@ -172,6 +172,21 @@ def test_more_flights_extend_a_folder_and_fewer_are_read_from_it(tmp_path, flown
     assert more.evaluations[0].decision_ms == fewer.evaluations[0].decision_ms
 
 
+def test_stored_flights_beyond_those_asked_for_do_not_stand_for_missing_ones(tmp_path, flown, monkeypatch):
+    monkeypatch.setattr(baselines.sweeps.store, "BLOCK", 2)
+    more = run_benchmark(SMALL | {"episodes": 4}, tmp_path)
+    for path in (tmp_path / "cells").glob("*-5-2.json"):  # the first block of each unit
+        path.unlink()
+    before, counts = len(flown), []
+    fewer = run_benchmark(
+        SMALL | {"episodes": 2}, tmp_path, on_unit=lambda count, total: counts.append(count)
+    )
+    assert counts == [0, 0, 1, 2, 3, 4]
+    assert len(flown) == before + 4 and [one.flights for one in fewer.evaluations] == 4 * [2]
+    for ours, theirs in zip(fewer.evaluations, more.evaluations, strict=True):
+        assert [one.score for one in ours.records] == [one.score for one in theirs.records[:2]]
+
+
 def test_a_unit_flies_again_when_a_file_that_it_reads_has_changed(tmp_path, flown):
     table = tmp_path / "ref.csv"
 

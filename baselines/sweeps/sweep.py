@@ -141,8 +141,9 @@ class Sweep:
         """A block is there; with the last one its unit is whole."""
         parts = self.parts.setdefault(unit.number, [])
         parts.append(part)
-        if sum(one.flights for one in parts) >= unit.episodes:
-            self.flown[unit.number] = Evaluation.joined(parts, unit.starts)
+        found = Evaluation.joined(parts, unit.starts)  # a folder may hold others, too
+        if found.flights == unit.episodes:
+            self.flown[unit.number] = found
 
     def _report(self) -> None:
         if self.order.on_unit is not None:
