@@ -192,18 +192,12 @@ def locked(folder: Path) -> Iterator[None]:
             f"cannot write into {str(folder)!r}: {error.strerror or error}; choose another folder"
         ) from error
     with file:
-        try:
-            _acquire(file.fileno())
-        except (BlockingIOError, PermissionError) as error:
+        if not _acquired(file.fileno(), path):
             held = _owner(path)
             raise ResultsError(
                 f"{str(folder)!r} is in use by process {held.get('pid', '?')} on {held.get('host', '?')}; "
                 "wait for it, or choose another folder"
-            ) from error
-        except OSError as error:
-            raise ResultsError(
-                f"cannot lock {str(path)!r}: {error.strerror or error}; choose a folder on another disk"
-            ) from error
+            )
         file.truncate(0)
         json.dump({"pid": os.getpid(), "host": socket.gethostname()}, file)
         file.flush()
@@ -239,16 +233,24 @@ def claimed(path: Path) -> Iterator[bool]:
             f"cannot write {str(path)!r}: {error.strerror or error}; choose another folder"
         ) from error
     with file:
-        try:
-            _acquire(file.fileno())
-        except (BlockingIOError, PermissionError):
-            yield False
-            return
-        except OSError as error:
-            raise ResultsError(
-                f"cannot lock {str(path)!r}: {error.strerror or error}; choose a folder on another disk"
-            ) from error
-        yield True
+        yield _acquired(file.fileno(), path)
+
+
+def _acquired(descriptor: int, path: Path) -> bool:
+    """Lock an open file at once; whether it is ours, or another process has it.
+
+    Raises:
+        ResultsError: If files cannot be locked there.
+    """
+    try:
+        _acquire(descriptor)
+    except (BlockingIOError, PermissionError):
+        return False
+    except OSError as error:
+        raise ResultsError(
+            f"cannot lock {str(path)!r}: {error.strerror or error}; choose a folder on another disk"
+        ) from error
+    return True
 
 
 def _acquire(descriptor: int) -> None:
