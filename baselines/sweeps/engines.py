@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, NamedTuple, TypeVar
@@ -141,13 +141,20 @@ def _found_again(path: list[str], source: str, work: Callable[[Any], Any], paylo
         ResultsError: If the process has other sources than the sweep: their numbers do not mix.
     """
     sys.path += [place for place in path if place not in sys.path]
-    if source_digest() != source:
+    ours = _own_sources()
+    if ours != source:
         raise ResultsError(
-            f"a worker has other sources ({source_digest()}) than this sweep ({source}): install the same "
+            f"a worker has other sources ({ours}) than this sweep ({source}): install the same "
             "version of quad-envs on every machine"
         )
     with _ONE_AT_A_TIME:
         return tried(work, pickle.loads(payload))
+
+
+@cache
+def _own_sources() -> str:
+    """Digest of the code of this process, which was read when it began."""
+    return source_digest()
 
 
 @contextmanager
