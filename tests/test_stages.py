@@ -93,6 +93,7 @@ def test_durations_are_said_as_people_say_them(seconds, said):
 def test_the_time_left_follows_the_work_and_not_the_count():
     assert said_left(10.0, 1.0, 4.0) == "about 30 s left"
     assert said_left(0.0, 0.0, 4.0) == ""
+    assert said_left(60.0, 3.0, 300.0) == "", "of the first minute most was compilation"
     assert said_left(12.0, 4.0, 4.0) == "took 12 s"
 
 

@@ -194,7 +194,7 @@ def _followed(asked: Iterator[Section], names: list[str], quiet: bool) -> Iterat
             if not quiet:
                 progress.write(f"{section}\n", sys.stdout)
                 sys.stdout.flush()
-            progress.write(f"{name}: {left}")
+            progress.write(f"{name}: {left or 'done'}")
             yield section
     finally:
         progress.close()

@@ -6,6 +6,7 @@ import sys
 from time import perf_counter
 from typing import Any, TextIO
 
+_TELLING = 0.05  # of the work, before which compilation says more of the pace than the work does
 _FORMAT = "{desc} {n_fmt}/{total_fmt} |{bar:20}| {postfix}"
 
 
@@ -17,7 +18,7 @@ def said_seconds(seconds: float) -> str:
 
 
 def said_left(spent: float, done: float, all_of_it: float) -> str:
-    """How long the rest takes, if it goes on at the pace so far.
+    """How long the rest takes, if it goes on at the pace so far; nothing before that tells much.
 
     Args:
         spent: Time so far, s.
@@ -26,7 +27,9 @@ def said_left(spent: float, done: float, all_of_it: float) -> str:
     """
     if done >= all_of_it:
         return f"took {said_seconds(spent)}"
-    return f"about {said_seconds(spent / done * (all_of_it - done))} left" if done > 0.0 else ""
+    if done < _TELLING * all_of_it:
+        return ""
+    return f"about {said_seconds(spent / done * (all_of_it - done))} left"
 
 
 class Progress:

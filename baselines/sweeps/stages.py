@@ -38,7 +38,8 @@ class SweepProgress:
             self._train = Progress("train", total)
             self._train.write(f"train: {total} policies")
             return
-        self._train.write(f"train: {finished} of {total} are there; {self._train.move(finished, total)}")
+        left = self._train.move(finished, total)
+        self._train.write(f"train: {finished} of {total} are there{'; ' * bool(left)}{left}")
         if finished == total:
             self._train.close()
 
