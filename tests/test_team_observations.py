@@ -175,3 +175,22 @@ def test_the_whole_state_has_named_parts():
     assert np.array_equal(state[where["graph"]].reshape(6, 6), env._batch.graph(7))
     assert not state[where["preview"]].any()
     assert state[where["time"]] == 7 / 400
+
+
+def test_the_state_of_a_batch_is_that_of_its_teams():
+    schedule = Switching(["chain", "star"], dwell_steps=4)
+    kwargs = {"vehicles": 3, "reference": "random", "graph": schedule, "terminate": "agent"}
+    for module, given in ((formation_v0, kwargs), (target_tracking_v0, {"target_spread": (0.5, 0.1)})):
+        batch, singles = module.vector_env(3, **given), [module.parallel_env(**given) for _ in range(3)]
+        batch.reset(seed=4)
+        for i, env in enumerate(singles):
+            env.reset(seed=4 + i)
+        rng, over = np.random.default_rng(0), np.zeros(3, dtype=bool)
+        for _ in range(40):
+            states = np.stack([env.state() for env in singles])
+            assert np.array_equal(batch.state()[~over], states[~over])
+            actions = rng.uniform(-1.0, 1.0, batch.action_space.shape).astype(np.float32)
+            batch.step(actions)
+            for env, own in zip(singles, np.split(actions, 3), strict=True):
+                env.step({name: own[env.possible_agents.index(name)] for name in env.agents})
+            over |= [not env.agents for env in singles]  # the batch begins these anew

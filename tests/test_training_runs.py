@@ -214,7 +214,7 @@ def test_bad_input_is_refused_before_anything_is_written(tmp_path, arguments, me
 @pytest.mark.parametrize(
     ("env_id", "algorithm", "message"),
     [
-        ("quad/Formation-v0", "sac", "those that can act there: apg, dagger, ppo, ppo-lagrangian"),
+        ("quad/Formation-v0", "sac", "those that can act there: apg, dagger, mappo, ppo, ppo-lagrangian"),
         ("quad/TargetTracking-v0", "sac", "trains on tracking tasks, not on target-tracking"),
         ("quad/CooperativeEstimation-v0", "apg", "not on estimation; .* none, its agents estimate"),
         ("quad/CooperativeEstimation-v0", "ppo", "its agents estimate and do not fly"),

@@ -94,7 +94,7 @@ class TrainOptions:
     """Train a network, judge it while it learns, and leave it as a checkpoint."""
 
     env: Annotated[str, Positional("environment id, as quad/HelixTracking-v0")]
-    algorithm: Annotated[str, Positional("apg, dagger, ppo, ppo-lagrangian or sac")]
+    algorithm: Annotated[str, Positional("apg, dagger, mappo, ppo, ppo-lagrangian or sac")]
     seed: Annotated[int, "of everything random"] = 0
     seconds: Annotated[float | None, "budget in CPU-seconds; the algorithm's own if not given"] = None
     steps: Annotated[int | None, "budget in environment steps instead"] = None

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _POSITIVE = (
     *("n_envs", "n_steps", "progress_steps", "batch_size", "n_epochs", "learning_rate", "final_rate"),
     *("gamma", "clip_range", "max_grad_norm", "command_range", "train_freq", "gradient_steps"),
-    *("buffer_size", "tau", "probes"),
+    *("buffer_size", "tau", "probes", "start_learning_rate"),
 )
 # Hyperparameters that take memory or time, and the largest that make sense.
 _MOST = {
@@ -117,6 +117,18 @@ class PpoOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class MappoOptions(PpoOptions):
+    """Hyperparameters of PPO with a critic that sees the whole team."""
+
+    critic_arch: tuple[int, ...] = (
+        128,
+        128,
+    )  # widths of the hidden layers of the critic; net_arch: the actor's
+    start_log_std: float = -3.5  # log_std_init, where training goes on from a policy
+    start_learning_rate: float = 3e-4  # learning_rate, where training goes on from a policy
+
+
+@dataclass(frozen=True, slots=True)
 class PpoLagrangianOptions(PpoOptions):
     """Hyperparameters of PPO with a bound on the share of violating steps."""
 
@@ -175,11 +187,12 @@ def check_sizes(options: Any, width: int) -> None:
         if value is not None and one.name in _MOST:
             least, most = int(one.name not in _MAY_BE_NONE), _MOST[one.name]
             require_whole(f"hyperparameter {one.name}", value, least, most, lambda n: 4 * n * width)
-    layers = options.net_arch
-    if len(layers) > _MOST_LAYERS:
-        raise ValueError(f"hyperparameter net_arch has at most {_MOST_LAYERS} layers, got {shown(layers)}")
-    for n in layers:
-        require_whole("a layer of hyperparameter net_arch", n, 1, _WIDEST, lambda n: 4 * n * (n + width))
+    for name in ("net_arch", "critic_arch"):
+        layers = getattr(options, name, ())
+        if len(layers) > _MOST_LAYERS:
+            raise ValueError(f"hyperparameter {name} has at most {_MOST_LAYERS} layers, got {shown(layers)}")
+        for n in layers:
+            require_whole(f"a layer of hyperparameter {name}", n, 1, _WIDEST, lambda n: 4 * n * (n + width))
     kept = options.n_envs * getattr(options, "n_steps", 1) + 2 * getattr(options, "buffer_size", 0)
     require_memory(
         f"training with {kept} observations of {width} numbers at a time",

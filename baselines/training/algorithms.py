@@ -23,6 +23,7 @@ from quad_envs.names import unknown_name
 from ..errors import MissingPackageError
 from .algorithm_options import (
     DaggerOptions,
+    MappoOptions,
     PolicyGradientOptions,
     PpoLagrangianOptions,
     PpoOptions,
@@ -43,6 +44,7 @@ class Algorithm(NamedTuple):
     description: str
     seconds: float = 60.0  # default budget, CPU-seconds
     packages: tuple[str, ...] = ("torch",)  # modules that it imports
+    elsewhere: str = ""  # what to do where it cannot act, after a semicolon
 
 
 _SB3 = ("torch", "stable_baselines3")
@@ -63,6 +65,17 @@ ALGORITHMS: dict[str, Algorithm] = {
         (TRACKING, FORMATION, TARGET),
         "imitation of an MPC, labelled where the network flies",
         15.0,
+    ),
+    "mappo": Algorithm(
+        ".central_critic",
+        "train",
+        MappoOptions,
+        "model-free",
+        (FORMATION, TARGET),
+        "proximal policy optimisation with a critic that sees the whole team",
+        150.0,
+        _SB3,
+        "its critic sees the state() of a team, which one vehicle has not: take ppo",
     ),
     "ppo": Algorithm(
         ".sb3",
@@ -111,6 +124,7 @@ def algorithm_for(name: str, mission: str) -> Algorithm:
         raise ValueError(
             f"algorithm {name!r} trains on {serves} tasks, not on {mission}; those that can act there: "
             f"{', '.join(able) if able else 'none, its agents estimate and do not fly'}"
+            f"{f'; {ALGORITHMS[name].elsewhere}' if able and ALGORITHMS[name].elsewhere else ''}"
         )
     return ALGORITHMS[name]
 

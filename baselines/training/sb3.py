@@ -10,12 +10,13 @@ import inspect
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv
 
 from quad_envs.encoding import Encoding
@@ -32,6 +33,7 @@ from .lagrangian import LagrangianBuffer, LagrangianEnv, Multiplier, Probe
 from .learner import RowBuffer, RowPPO, Tanh
 from .vec_env import TaskOptions, TrainingVecEnv
 
+F = TypeVar("F", bound=TrainingVecEnv)
 _PROBES = 500_000_009  # from the seed of training to that of the flights which measure violations
 _NEVER = 2**31  # updates between logs of stable-baselines3; runs keep their own
 
@@ -62,7 +64,7 @@ def train_ppo(
     """
     flights = make_flights(task_options, options, seed, start)
     model = make_ppo(flights, options, seed, spent)
-    yield from _updates(model, flights, options, spent, start)
+    yield from updates(model, flights, options, spent, start)
 
 
 def train_ppo_lagrangian(
@@ -91,7 +93,7 @@ def train_ppo_lagrangian(
     model = make_ppo(env, options, seed, spent, (LagrangianBuffer, buffer))
     # Other starts than those of training, so that both see new ones.
     probe = Probe(make_flights(task_options, replace(options, n_envs=options.probes), seed + _PROBES, start))
-    yield from _updates(model, flights, options, spent, start, (multiplier, probe))
+    yield from updates(model, flights, options, spent, start, (multiplier, probe))
 
 
 def train_sac(
@@ -114,11 +116,14 @@ def train_sac(
         )
     flights = make_flights(task_options, options, seed, start)
     model = make_sac(flights, options, seed, spent)
-    yield from _updates(model, flights, options, spent, start)
+    yield from updates(model, flights, options, spent, start)
 
 
 def make_flights(
-    task_options: TaskOptions, options: PpoOptions | SacOptions, seed: int, start: Network | None = None
+    task_options: TaskOptions,
+    options: PpoOptions | SacOptions,
+    seed: int,
+    start: Network | None = None,
 ) -> TrainingVecEnv:
     """Flights to train on: as many teams as make about `n_envs` vehicles, or `n_envs` single ones.
 
@@ -126,6 +131,17 @@ def make_flights(
         ValueError: If the preview has not the stages that the network shall see, or actions of the task are
             no rotor commands.
     """
+    return flights_of(TrainingVecEnv, task_options, options, seed, start)
+
+
+def flights_of(
+    kind: Callable[..., F],
+    task_options: TaskOptions,
+    options: PpoOptions | SacOptions,
+    seed: int,
+    start: Network | None = None,
+) -> F:
+    """Flights of a kind, see `make_flights`."""
     size = task_options.vehicles if isinstance(task_options, TeamOptions) else 1
     stages = options.stages
     if stages is None and isinstance(task_options, TrackingOptions):
@@ -137,7 +153,7 @@ def make_flights(
     if start is not None:
         encoding = start.encoding
     n = max(1, options.n_envs // size)
-    return TrainingVecEnv(task_options, n, seed, encoding=encoding, episode_steps=options.episode_steps)
+    return kind(task_options, n, seed, encoding=encoding, episode_steps=options.episode_steps)
 
 
 def make_ppo(
@@ -146,13 +162,14 @@ def make_ppo(
     seed: int,
     spent: Callable[[], float],
     buffer: tuple[type[RowBuffer], dict[str, Any]] = (RowBuffer, {}),
+    policy: tuple[str | type[ActorCriticPolicy], dict[str, Any]] = ("MlpPolicy", {}),
 ) -> PPO:
-    """The learner, not yet trained; `buffer` is the class of its rollouts and what that needs."""
+    """The learner, not yet trained; `buffer` and `policy` are a class and what it needs."""
     samples = env.num_envs * options.n_steps
     arguments = _arguments(PPO, options, spent)
     arguments["batch_size"] = math.ceil(samples / max(1, round(samples / options.batch_size)))
     model = RowPPO(
-        "MlpPolicy",
+        policy[0],
         env,
         **arguments,
         policy_kwargs={
@@ -160,6 +177,7 @@ def make_ppo(
             "activation_fn": Tanh,
             "log_std_init": options.log_std_init,
             "optimizer_kwargs": {"eps": 1e-5, "fused": True},
+            **policy[1],
         },
         rollout_buffer_class=buffer[0],
         rollout_buffer_kwargs=buffer[1],
@@ -251,7 +269,7 @@ def _falling(first: float, last_share: float, spent: Callable[[], float]) -> Cal
     return lambda _: first * (1.0 - (1.0 - last_share) * min(spent(), 1.0))
 
 
-def _updates(
+def updates(
     model: PPO | SAC,
     flights: TrainingVecEnv,
     options: PpoOptions | SacOptions,

@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from quad_envs.encoding import Encoding
 from quad_envs.envs.team.batch import TeamBatch
-from quad_envs.envs.team.options import TeamOptions
+from quad_envs.envs.team.options import TeamOptions, Terminate
 from quad_envs.envs.tracking.batch import TrackingBatch
 from quad_envs.envs.tracking.options import TrackingOptions
 from quad_envs.names import shown
@@ -46,8 +46,8 @@ class Tally(NamedTuple):
 class TrainingVecEnv(VecEnv):
     """n flights, or the vehicles of n teams, that begin anew in the step in which they end.
 
-    Row by row it is `TrackingVectorEnv` or `TeamVectorEnv`; vehicle i of team t is row t N + i. A team whose
-    vehicles crash ends as a whole, so that no row is ever of a vehicle that is no more.
+    Row by row it is `TrackingVectorEnv` or `TeamVectorEnv`; vehicle i of team t is row t N + i. A team in
+    which a vehicle crashes ends as a whole, so that no row is ever of a vehicle that is no more.
 
     Args:
         options: Of the task.
@@ -58,6 +58,8 @@ class TrainingVecEnv(VecEnv):
         staggered: Whether the first episodes are cut at random, so that flights are at all times of the
             episode from then on. A cut counts as a truncation.
         episode_steps: After which an episode is cut, if the task's is longer: short ones see more starts.
+        blame: Who a crash is told of: "team", all vehicles, as the task has it; or "agent", those that
+            crashed alone: for the others the end is a truncation, as they could have flown on.
 
     Raises:
         ValueError: If n < 1, or actions of the task are no rotor commands.
@@ -74,12 +76,13 @@ class TrainingVecEnv(VecEnv):
         encoding: Encoding | None = None,
         staggered: bool = True,
         episode_steps: int | None = None,
+        blame: Terminate = "team",
     ) -> None:
         if n < 1:
             raise ValueError(f"the number of flights or teams must be >= 1, got {shown(n)}")
         self._batch: TrackingBatch | TeamBatch
         if isinstance(options, TeamOptions):
-            self._batch = TeamBatch(replace(options, terminate="team"), n)
+            self._batch = TeamBatch(replace(options, terminate=blame), n)
             self._size = options.vehicles
         else:
             self._batch, self._size = TrackingBatch(options, n), 1
@@ -142,7 +145,7 @@ class TrainingVecEnv(VecEnv):
             self._left[:] = self._stagger.integers(1, self._steps_of_episode + 1, self._n)
         self.costs = np.zeros(self.num_envs)
         self.violated, self.crashed = np.zeros((2, self.num_envs), dtype=np.bool_)
-        return self._observer.see(self._out, np.ones(self.num_envs, dtype=np.bool_))
+        return self._see(self._out, np.ones(self.num_envs, dtype=np.bool_))
 
     def step_async(self, actions: Floats) -> None:
         """Take the network's outputs, (rows, action size), in [-1, 1]."""
@@ -161,9 +164,9 @@ class TrainingVecEnv(VecEnv):
         self._reward += float(rewards.sum())
         self._violations += int(np.count_nonzero(self.violated))
         self._left -= 1
-        ended = (self.crashed | truncated).reshape(self._n, self._size).all(axis=1)
+        ended = (self.crashed | truncated).reshape(self._n, self._size).any(axis=1)
         ended |= self._left == 0
-        seen, dones, infos = self._observer.see(self._out), np.repeat(ended, self._size), self._infos[:]
+        seen, dones, infos = self._see(self._out), np.repeat(ended, self._size), self._infos[:]
         if not ended.any():
             return seen, rewards, dones, infos
         rows = np.flatnonzero(dones)
@@ -173,8 +176,14 @@ class TrainingVecEnv(VecEnv):
                 "TimeLimit.truncated": not bool(self.crashed[row]),
             }
         self._begin(np.flatnonzero(ended))
-        seen[rows] = self._observer.see(self._out[rows], np.ones(len(rows), dtype=np.bool_), rows)
+        seen[rows] = self._see(self._out[rows], np.ones(len(rows), dtype=np.bool_), rows)
         return seen, rewards, dones, infos
+
+    def _see(
+        self, observations: Floats, begins: Bools | None = None, rows: NDArray[np.int64] | None = None
+    ) -> Floats:
+        """What the learner sees of them, see `Observer.see`."""
+        return self._observer.see(observations, begins, rows)
 
     def _step(self) -> Bools:
         """Move all rows, and take over their scores; which rows are at the end of their time."""

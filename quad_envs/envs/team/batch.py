@@ -18,11 +18,13 @@ from ...constraints import constraint_scales
 from ...formations import start_positions
 from ...graphs import in_neighbours
 from ...lanes import (
+    ALIVE,
     LANES,
     MEASURES,
     MOST_VALUES,
     N_PLANT,
     N_TEAM,
+    PLANT,
     STEP,
     Blocks,
 )
@@ -287,6 +289,22 @@ class TeamBatch(PackedBatch):
     def graph(self, k: int) -> Array:
         """Weights G at step k, (N, N)."""
         return np.asarray(self.graphs.graphs[self.graphs.which[k]])
+
+    def state(self) -> Array:
+        """The whole truth of each team, (teams, S), parts as in `TeamTask.state_slices`."""
+        n, stages, first = self.n, self.task.layout.preview + 1, slice(None, None, self.n)
+        k = self.vehicles.read(STEP)[first].astype(np.int64)
+        alive = self.vehicles.read(ALIVE).reshape(-1, n)
+        preview = np.zeros((self.teams, stages, N_REFERENCE))
+        if self.options.has_leader:
+            at = self._which[REFERENCE, first][:, None], k[:, None] + np.arange(stages)
+            preview = self.references[at][..., :N_REFERENCE]
+        target = np.zeros((self.teams, N_TARGET))
+        if self._target is not None:
+            target = self.targets[self._which[TARGET, first], k]
+        graph = self.graphs.graphs[np.asarray(self.graphs.which)[k]] * alive[:, None] * alive[:, :, None]
+        parts = self.vehicles.read(PLANT, N_PLANT), target, graph, preview, k / self.task.episode_steps
+        return np.concatenate([part.reshape(self.teams, -1) for part in parts], axis=1)
 
     def heard(self, t: int) -> Array:
         """Weight, sent, received of the last message in each comm slot of team t, a view, (N, K, 3)."""

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from ...graphs import GraphTable
-from ...lanes import ALIVE, N_PLANT, PLANT, STEP
+from ...lanes import N_PLANT, PLANT
 from ...names import shown
 from ...plant import Array
-from ...table_row import N_REFERENCE
 from ...tasks import TeamTask
 from ..shared.render_modes import NO_RENDERING, checked_rendering
 from .batch import TeamBatch
@@ -131,14 +130,7 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
         rows and columns of zeros, G_ii included, for vehicles that crashed; the leader's reference rows
         k..k+N_p (zero without a leader); t / T.
         """
-        batch, k = self._batch, int(self._batch.vehicles.read(STEP)[0])
-        stages = self.task.layout.preview + 1
-        rows = batch.references[0, k : k + stages, :N_REFERENCE]
-        preview = rows if batch.options.has_leader else np.zeros((stages, N_REFERENCE))
-        alive = batch.vehicles.read(ALIVE)
-        graph = batch.graph(k) * alive * alive[:, None]
-        parts = (self.plants, batch.target(0)[k], graph, preview, k / self.task.episode_steps)
-        return np.concatenate([np.ravel(part) for part in parts])
+        return np.asarray(self._batch.state()[0])
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None

@@ -103,6 +103,13 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
         """Rows r, v of each team's target, (n, T+1, 6); zero where there is none. For study and tests."""
         return np.stack([self._batch.target(t) for t in range(self.num_teams)])
 
+    def state(self) -> Array:
+        """The whole truth of each team, as the parallel environment's `state()`, (n, S), for central critics.
+
+        `task.state_slices` names its parts. Of a team that is done it is the end, until the team begins anew.
+        """
+        return self._batch.state()
+
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
