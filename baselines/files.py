@@ -124,9 +124,18 @@ def _parsed(path: Path) -> Any:
     return json.loads(path.read_text())
 
 
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows with the union of their columns; what is absent or nan stays empty."""
-    columns = list(dict.fromkeys(key for row in rows for key in row))
+def write_csv(path: Path, rows: Iterable[Mapping[str, Any]], columns: Iterable[str] = ()) -> None:
+    """Write rows; what is absent or nan stays empty.
+
+    Args:
+        path: Of the file.
+        rows: One after another, if the columns are given.
+        columns: Their names; the union of those of all rows, if not given.
+    """
+    columns = list(columns)
+    if not columns:
+        rows = list(rows)
+        columns = list(dict.fromkeys(key for row in rows for key in row))
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, columns, restval="")
     writer.writeheader()

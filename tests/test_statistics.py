@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu, trim_mean
 
-from baselines.evaluation.statistics import compare, interquartile_mean
+from baselines.evaluation.statistics import compare, difference, interquartile_mean, mean_interval
 
 
 def test_the_interquartile_mean_is_scipys_trimmed_mean():
@@ -53,3 +53,11 @@ def test_tasks_count_the_same_however_many_starts_they_have():
 def test_what_cannot_be_compared_is_refused(ours, theirs, message):
     with pytest.raises(ValueError, match=message):
         compare(ours, theirs)
+
+
+def test_what_is_drawn_in_portions_is_no_other_statistic(monkeypatch):
+    rng = np.random.default_rng(5)
+    ours, theirs = ([rng.normal(size=(1, 200))] for _ in range(2))
+    whole = compare(ours, theirs), difference(ours, theirs), mean_interval(ours[0])
+    monkeypatch.setattr("baselines.evaluation.statistics._AT_ONCE", 3_333)  # 16 resamples at a time
+    assert (compare(ours, theirs), difference(ours, theirs), mean_interval(ours[0])) == whole

@@ -8,6 +8,7 @@ from quad_envs.checks import require_memory, require_whole
 
 MOST_EPISODES = 100_000
 INTERVAL_LEAST = 5  # flights, below which no interval is said
+TAILS_LEAST = 1000  # flights, below which nothing is said of one in a thousand
 _EPISODE_BYTES = 4000  # a record, and two float32 decision times of 200 steps
 _MOST_JOBS = 1024
 _JOB_BYTES = 200_000_000  # an interpreter with its compiled kernels

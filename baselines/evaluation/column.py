@@ -28,11 +28,13 @@ class Mark(Flag):
     MOST = auto()  # the largest over flights, not averaged
     UNSEEN = auto()  # in files, not on the page
     REPORTED = auto()  # only of policies that report it; in no table where none does
+    TAILED = auto()  # where there are many flights its 99.9 % quantile is told, as `<name>_tail`
+    TAIL = auto()  # says how bad rare flights are, with both ends of an interval; only where there are many
     PLAIN = 0  # none of these
 
 
 MORE, LESS, SINGLE, TEAM, LEAST, LARGEST, WORST, CUT_SHORT, COMPARED, PERCENT = list(Mark)[:10]
-COUNTED, FALLBACK, TIMED, MOST, UNSEEN, REPORTED = list(Mark)[10:]
+COUNTED, FALLBACK, TIMED, MOST, UNSEEN, REPORTED, TAILED, TAIL = list(Mark)[10:]
 _NOT_AVERAGED = COUNTED | FALLBACK | TIMED | MOST
 
 
@@ -88,9 +90,21 @@ class Column:
             self,
             title=f"{self.title}, worst",
             about=f"{self.about}, of the worst vehicle",
-            marks=self.marks & ~(WORST | COMPARED) | LARGEST,
+            marks=self.marks & ~(WORST | COMPARED | TAILED) | LARGEST,
             printed=self.printed and f"{self.printed} worst",
             name=f"{self.name}_worst",
+        )
+
+    def tail(self) -> Column:
+        """The quantile over flights that all but one in a thousand stay below."""
+        return replace(
+            self,
+            title=f"{self.title}, 99.9 %",
+            about=f"{self.title} that 99.9 % of the flights stay below; a crash counts as larger than any",
+            marks=self.marks & (SINGLE | TEAM | LESS) | TAIL,
+            printed=self.printed and f"{self.printed} 99.9 %",
+            name=f"{self.name}_tail",
+            source="",
         )
 
     def difference(self) -> Column:

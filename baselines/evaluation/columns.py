@@ -27,6 +27,8 @@ from .column import (
     PERCENT,
     REPORTED,
     SINGLE,
+    TAIL,
+    TAILED,
     TEAM,
     TIMED,
     UNSEEN,
@@ -57,7 +59,11 @@ class Record(NamedTuple):
     ]  # violation / scale over the limits, as in safe RL
     position_rms: Annotated[
         float,
-        Column("Position RMS", "m", "distance to the reference", LESS | SINGLE | CUT_SHORT | COMPARED, "RMS"),
+        Column(
+            *("Position RMS", "m", "distance to the reference"),
+            LESS | SINGLE | CUT_SHORT | COMPARED | TAILED,
+            "RMS",
+        ),
     ]  # sqrt(mean |p_k - p_ref,k|^2), k = 0..T-1
     steady_rms: Annotated[
         float,
@@ -71,7 +77,10 @@ class Record(NamedTuple):
     ]  # nan if it stays above to the end, or begins below 0.1 m
     formation_rms: Annotated[
         float,
-        Column("Slot RMS", "m", "distance to the own slot", LESS | TEAM | CUT_SHORT | COMPARED | WORST),
+        Column(
+            *("Slot RMS", "m", "distance to the own slot"),
+            LESS | TEAM | CUT_SHORT | COMPARED | WORST | TAILED,
+        ),
     ]
     formation_final: Annotated[
         float,
@@ -101,7 +110,7 @@ class Record(NamedTuple):
         float,
         Column(
             *("Estimate RMSE", "m", "estimated position of the target"),
-            LESS | TEAM | CUT_SHORT | COMPARED | WORST,
+            LESS | TEAM | CUT_SHORT | COMPARED | WORST | TAILED,
             "estimate",
         ),
     ]
@@ -126,7 +135,14 @@ class Record(NamedTuple):
     ]
     worst_violation: dict[str, float]  # constraint name -> largest excess over its limit, SI
     crashed: Annotated[
-        bool, Column("Crashes", "", "flights that ended in a crash", LESS | COUNTED, "crashes")
+        bool,
+        Column("Crashes", "", "flights that ended in a crash", LESS | COUNTED, "crashes"),
+        Column(
+            *("P(crash)", "", "share of flights that crashed, with its Clopper-Pearson interval"),
+            LESS | PERCENT | TAIL,
+            "P(crash)",
+            "crash_probability",
+        ),
     ]
     crash_cause: str  # one of `task.crash_causes`
     saturation_share: Annotated[
@@ -218,11 +234,15 @@ class Record(NamedTuple):
 
 
 def _columns() -> Iterator[Column]:
-    """Columns of the Record; what summaries add has a name of its own, the worst vehicle follows the mean."""
+    """Columns of the Record; what summaries add has a name of its own, worst and tail follow the mean."""
     for name, hint in get_type_hints(Record, include_extras=True).items():
         for column in getattr(hint, "__metadata__", ()):
             named = column if column.name else replace(column, name=name, source=name)
-            yield from (named, named.worst()) if named.has(WORST) else (named,)
+            yield named
+            if named.has(WORST):
+                yield named.worst()
+            if named.has(TAILED):
+                yield named.tail()
 
 
 COLUMNS = {column.name: column for column in _columns()}

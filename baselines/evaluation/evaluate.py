@@ -17,7 +17,7 @@ from ..policies.environments import make_env
 from ..policies.outside import is_policy
 from ..policies.protocol import Policy
 from ..policies.registry import make_policy, policy_name
-from .column import CUT_SHORT, REPORTED
+from .column import CUT_SHORT, PERCENT, REPORTED, Column
 from .columns import COLUMNS, Record, read_record
 from .episode import Episode
 from .metrics import (
@@ -33,7 +33,9 @@ from .metrics import (
 from .rollout import check_flights, is_privileged, run_episodes, time_decisions, with_times
 from .row_forms import has_row_form, row_form
 from .rows import row_episodes
-from .table import Table, format_number
+from .statistics import Interval
+from .table import Table, format_number, said_interval
+from .tails import tails
 from .team_metrics import by_flight, flight_values, has_team
 
 _NOT_TIMED = (math.nan, math.nan, math.nan)
@@ -76,9 +78,14 @@ class Evaluation:
         """Column -> mean and 95 % interval over the flights."""
         return summarize(self.records)
 
+    def tails(self) -> dict[str, Interval]:
+        """Column -> how bad rare flights are, see `tails`; empty below 1000 flights."""
+        return tails(self.records)
+
     def to_dict(self) -> dict[str, Any]:
         """As plain numbers for JSON; what is not a number is None."""
         p50, p99, slowest = self.decision_ms
+        rare = {name: value._asdict() for name, value in self.tails().items()}
         found = {
             "env": self.env_id,
             "policy": self.title,
@@ -87,6 +94,7 @@ class Evaluation:
             "summary": {name: value._asdict() for name, value in self.summary().items()},
             **totals(self.records),
             "crash_causes": crash_causes(self.records),
+            **({"tails": rare} if rare else {}),
             "iterations_max": max(record.iterations_max for record in self.records),
             "worst_violation": dict(worst_violations(self.records)),
             "decision_ms": {"p50": p50, "p99": p99, "max": slowest},
@@ -166,6 +174,7 @@ class Evaluation:
         worst = worst_violations(self.records)
         if crash_causes(self.records):
             lines.append(f"crashes by: {said_causes(self.records)}")
+        lines += [_tail_line(COLUMNS[name], value) for name, value in self.tails().items()]
         if worst:
             lines.append("worst violation: " + ", ".join(f"{k} {format_number(v)}" for k, v in worst.items()))
         header = ["metric", "unit", "mean", "+- 95 %", "min", "max", "flights"]
@@ -179,6 +188,13 @@ class Evaluation:
             return True
         lost = COLUMNS[name].has(CUT_SHORT) and not name.startswith("estimate")
         return any(map(math.isfinite, values)) or (lost and any(record.crashed for record in self.records))
+
+
+def _tail_line(column: Column, value: Interval) -> str:
+    """How bad rare flights are, as "Position RMS, 99.9 %: 0.21 m [0.2, 0.23]"."""
+    unit = "%" if column.has(PERCENT) else column.unit
+    shown = Interval(*(column.factor * number for number in value))
+    return f"{column.title}: {said_interval(*shown, unit)}, 95 % interval"
 
 
 def _times(quantiles: tuple[float, float, float]) -> str:

@@ -10,7 +10,7 @@ the starts paired.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ from .amounts import INTERVAL_LEAST
 
 RESAMPLES = 2_000
 _COVERED = (2.5, 97.5)  # percentiles of the resamples
+_AT_ONCE = 8_000_000  # drawn values that are held together, 64 MB
 
 
 class Interval(NamedTuple):
@@ -69,15 +70,13 @@ def compare(
     """
     _check(ours, theirs)
     rng = np.random.default_rng(seed)
-    exact, drawn = _Pieces(), _Pieces()
-    for x, y in zip(ours, theirs, strict=True):
-        exact.add(x[None], y[None])
-        drawn.add(*_resample(x, y, resamples, rng))
+    exact = _Pieces((x[None], y[None]) for x, y in zip(ours, theirs, strict=True))()
+    drawn = [_Pieces(_resample(ours, theirs, n, rng))() for n in _portions(ours, theirs, resamples)]
     few = any(x.shape[1] < INTERVAL_LEAST for x in ours)
     return Comparison(
         *(
             Interval(float(one[0]), *((math.nan,) * 2 if few else _range(many)))
-            for one, many in zip(exact(), drawn(), strict=True)
+            for one, many in zip(exact, map(np.concatenate, zip(*drawn, strict=True)), strict=True)
         )
     )
 
@@ -91,9 +90,13 @@ def difference(
     value = float(np.mean([x.mean() - y.mean() for x, y in zip(ours, theirs, strict=True)]))
     if any(x.shape[1] < INTERVAL_LEAST for x in ours):
         return Interval(value, math.nan, math.nan)
-    drawn = [_resample(x, y, resamples, rng) for x, y in zip(ours, theirs, strict=True)]
-    means = np.mean([x.mean(axis=(1, 2)) - y.mean(axis=(1, 2)) for x, y in drawn], axis=0)
-    return Interval(value, *_range(means))
+    means = [
+        np.mean(
+            [x.mean(axis=(1, 2)) - y.mean(axis=(1, 2)) for x, y in _resample(ours, theirs, n, rng)], axis=0
+        )
+        for n in _portions(ours, theirs, resamples)
+    ]
+    return Interval(value, *_range(np.concatenate(means)))
 
 
 def mean_interval(values: Array, resamples: int = RESAMPLES, seed: int = 0) -> Interval:
@@ -101,19 +104,26 @@ def mean_interval(values: Array, resamples: int = RESAMPLES, seed: int = 0) -> I
     value = float(values.mean())
     if values.shape[1] < INTERVAL_LEAST or not math.isfinite(value):
         return Interval(value, math.nan, math.nan)
-    drawn, _ = _resample(values, values[:1], resamples, np.random.default_rng(seed))
-    return Interval(value, *_range(drawn.mean(axis=(1, 2))))
+    rng, sides = np.random.default_rng(seed), ([values], [values[:1]])
+    means = [
+        drawn.mean(axis=(1, 2))
+        for n in _portions(*sides, resamples)
+        for drawn, _ in _resample(*sides, n, rng)
+    ]
+    return Interval(value, *_range(np.concatenate(means)))
 
 
 class _Pieces:
     """What the statistics of several tasks are made of, in several resamples at once."""
 
-    def __init__(self) -> None:
+    def __init__(self, tasks: Iterable[tuple[Array, Array]]) -> None:
         self._values: list[Array] = []
         self._differences: list[Array] = []
         self._improvements: list[Array] = []
+        for x, y in tasks:
+            self._add(x, y)
 
-    def add(self, x: Array, y: Array) -> None:
+    def _add(self, x: Array, y: Array) -> None:
         """One more task: x (n, S, E) and y (n, S', E) in n resamples."""
         self._values.append(x.reshape(len(x), -1))
         self._differences.append(x.mean(axis=(1, 2)) - y.mean(axis=(1, 2)))
@@ -129,11 +139,22 @@ class _Pieces:
         )
 
 
-def _resample(x: Array, y: Array, n: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """(n, S, E) and (n, S', E): seeds of each side by themselves, starts together."""
-    starts = rng.integers(x.shape[1], size=(n, 1, x.shape[1]))
-    own, other = (rng.integers(len(z), size=(n, len(z), 1)) for z in (x, y))
-    return x[own, starts], y[other, starts]
+def _portions(ours: Sequence[Array], theirs: Sequence[Array], resamples: int) -> list[int]:
+    """How many resamples are drawn at a time, so that what is held does not grow with the starts."""
+    size = sum(max(x.size, y.size) for x, y in zip(ours, theirs, strict=True))
+    most = max(1, _AT_ONCE // size)
+    whole, rest = divmod(resamples, most)
+    return [most] * whole + [rest] * (rest > 0)
+
+
+def _resample(
+    ours: Sequence[Array], theirs: Sequence[Array], n: int, rng: np.random.Generator
+) -> Iterator[tuple[Array, Array]]:
+    """(n, S, E) and (n, S', E) of each task: seeds of each side by themselves, starts together."""
+    for x, y in zip(ours, theirs, strict=True):
+        starts = rng.integers(x.shape[1], size=(n, 1, x.shape[1]))
+        own, other = (rng.integers(len(z), size=(n, len(z), 1)) for z in (x, y))
+        yield x[own, starts], y[other, starts]
 
 
 def _range(values: Array) -> tuple[float, float]:

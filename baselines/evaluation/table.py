@@ -96,7 +96,13 @@ def _cell(row: Mapping[str, Any], column: Column) -> str:
     value, low = row[column.name], f"{column.name}_low"
     if column.has(COUNTED):
         return str(value)
-    text = format_number(column.factor * value)
     if low not in row or not math.isfinite(row[low]):
-        return text
-    return f"{text} [{format_number(row[low], 3)}, {format_number(row[f'{column.name}_high'], 3)}]"
+        return format_number(column.factor * value)
+    numbers = (value, row[low], row[f"{column.name}_high"])
+    return said_interval(*(column.factor * number for number in numbers))
+
+
+def said_interval(value: float, low: float, high: float, unit: str = "") -> str:
+    """A number with the ends of its interval in brackets, '-' where there is none."""
+    text = f"{format_number(value)} {unit}".rstrip()
+    return f"{text} [{format_number(low, 3)}, {format_number(high, 3)}]"

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..evaluation import column as evaluation
-from ..evaluation.column import COMPARED, COUNTED, PERCENT, UNSEEN
+from ..evaluation.column import COMPARED, COUNTED, PERCENT, TAIL, UNSEEN
 from ..evaluation.columns import COLUMNS, fallbacks, limits_in, shown
 from ..sweeps.contenders import SCORES, SEEDS, TRAININGS
 from .frontier import Point, Spread, draw_frontier
@@ -66,6 +66,8 @@ def _page_column(column: evaluation.Column, base: str, kind: str = "") -> Column
 
 
 def _kind(column: evaluation.Column) -> str:
+    if column.has(TAIL):
+        return "interval"
     if column.has(PERCENT | COUNTED):
         return "percent" if column.has(PERCENT) else "count"
     return "score" if column.name == "score" else "number"
@@ -73,11 +75,17 @@ def _kind(column: evaluation.Column) -> str:
 
 def _row(summary: Mapping[str, Any], columns: Sequence[Column]) -> Row:
     found = {**summary, "fallbacks": fallbacks(summary)}
-    cells: dict[str, tuple[float | None, ...]] = {
-        column.key: (_number(found.get(column.key)), _number(found.get(f"{column.key}_ci")))
-        for column in columns
-    }
+    cells = {column.key: _cell(found, column) for column in columns}
     return Row(str(summary["policy"]), bool(summary.get("privileged", False)), cells)
+
+
+def _cell(found: Mapping[str, Any], column: Column) -> tuple[float | None, ...]:
+    """A mean and its half width, or a number and both ends of its interval, in the unit that is shown."""
+    if column.kind != "interval":
+        return _number(found.get(column.key)), _number(found.get(f"{column.key}_ci"))
+    factor = 100.0 if column.unit == "%" else 1.0
+    numbers = (found.get(f"{column.key}{end}") for end in ("", "_low", "_high"))
+    return tuple(_number(None if number is None else factor * number) for number in numbers)
 
 
 def _number(value: Any) -> float | None:

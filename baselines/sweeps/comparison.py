@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -57,11 +57,18 @@ class Results:
 
     def rows(self) -> list[dict[str, Any]]:
         """One row per environment x policy x flight, of a team one per vehicle (column agent)."""
-        return [
-            {"env": unit.env.title, "policy": unit.policy.title, **record.row()}
-            for unit, evaluation in zip(self.flown(), self.evaluations, strict=True)
-            for record in evaluation.records
-        ]
+        return list(self.each_row())
+
+    def each_row(self) -> Iterator[dict[str, Any]]:
+        """Those rows one after another: of many flights they would take far more memory than the flights."""
+        for unit, evaluation in zip(self.flown(), self.evaluations, strict=True):
+            for record in evaluation.records:
+                yield {"env": unit.env.title, "policy": unit.policy.title, **record.row()}
+
+    def row_columns(self) -> list[str]:
+        """Their columns."""
+        firsts = (evaluation.records[0].row() for evaluation in self.evaluations)
+        return list(dict.fromkeys(["env", "policy", *(name for row in firsts for name in row)]))
 
     def summary(self) -> list[dict[str, Any]]:
         """One row per environment x policy: means, half widths (_ci), paired differences (_minus_base)."""
@@ -94,6 +101,8 @@ class Results:
                     difference.mean,
                     difference.half_width,
                 )
+        for name, tail in ours.tails().items():
+            row |= {name: tail.value, f"{name}_low": tail.low, f"{name}_high": tail.high}
         row |= totals(ours.records) | {"crash_causes": said_causes(ours.records)}
         row["iterations_max"] = max(record.iterations_max for record in ours.records)
         row |= {f"worst_{name}": value for name, value in worst_violations(ours.records).items()}

@@ -197,7 +197,7 @@ class Sweep:
 def _write_tables(folder: Path, results: Results) -> None:
     """The tables of a finished run."""
     write_csv(folder / "summary.csv", results.summary())
-    write_csv(folder / "results.csv", results.rows())
+    write_csv(folder / "results.csv", results.each_row(), results.row_columns())
     (folder / FAILURES).unlink(missing_ok=True)
     if results.failures:
         write_json(folder / FAILURES, [failure._asdict() for failure in results.failures])

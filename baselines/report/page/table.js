@@ -85,12 +85,13 @@ function intervalCell(column, [value, low, high], isBase) {
   const isDifference = column.key.endsWith("_minus_base");
   if (isBase && isDifference) return element("td", { class: "half" }, "base");
   const known = low !== null && high !== null;
+  const open = low !== null && !isDifference; // no upper end: too few flights to bound what is rare
   const word = !isDifference || !known || low * high <= 0 ? "" : value > 0 ? "better" : "worse";
   const places = known && high > low ? placesOf(0.5 * (high - low)) : null;
-  const said = (x) => (places === null ? number(x, 3) : toPlaces(x, places));
+  const said = (x) => (x === null || places === null ? number(x, 3) : toPlaces(x, places));
   const text = isDifference ? withSign(said(value)) : said(value);
   const mark = word ? (value > 0 ? "▲ " : "▼ ") : "";
-  const ends = known ? element("span", { class: "half" }, `[${said(low)}, ${said(high)}]`) : null;
+  const ends = known || open ? element("span", { class: "half" }, `[${said(low)}, ${said(high)}]`) : null;
   return element("td", { class: word }, mark + text, ends);
 }
 
