@@ -272,11 +272,6 @@ class ExactNmpc(Mpc):
         self._data = self._data._replace(model_tilt=EXACT_TILT)
         self.passes = int(options.passes)
         self._inertial = options.velocity_error == "inertial"
-        self._floor = COST_FLOOR
-        if options.objective == "score":
-            self._floor = float(options.floor)
-            if self._data.own_rows > 0:  # a plan that flies to its limits has to know how late the rotors are
-                self._data = self._data._replace(lag=1.0 / task.params.rotor_rate)
 
     def _call(self, buffer: Array, ws: Workspace) -> _Call:
         return _Call(self.passes, self._inertial, self._floor, self._keep_from, self._data, buffer, ws)

@@ -23,18 +23,20 @@ from .kernels import (
     end_row,
     hold_trim,
     left_model,
-    solve_within_model,
 )
+from .linear_score import begin_guess, refuses_plan, solve_for_objective, weigh_about_guess
 from .mpc import Mpc, Problem
 from .options import LmpcOptions, chosen
+from .score import COST_FLOOR
 
 
 class _Call(NamedTuple):
     """What a decision takes beside its rows."""
 
-    A: Annotated[Array, "1, 12, 12"]
-    B: Annotated[Array, "1, 12, 4"]
+    A: Annotated[Array, "1 or N, 12, 12"]
+    B: Annotated[Array, "1 or N, 12, 4"]
     stationary: bool  # whether data.P solves the Riccati equation of the pair
+    floor: float  # of the stage weights, see `score.weigh_stages`
     data: MpcData
     buffer: Annotated[Array, "numbers"]
     ws: Workspace
@@ -57,20 +59,19 @@ def _decide_rows(
     words: IntArray,
 ) -> int:
     """One decision per row; -1, or the code of the first argument that is not finite."""
-    A, B, stationary, data, buffer, ws = _unpack(words)
+    A, B, stationary, floor, data, buffer, ws = _unpack(words)
     N = ws.u.shape[0]
     bad = first_non_finite(plants, windows, lasts, disturbances, memories, N + 1)
     if bad >= 0:
         return bad
     H, K = data.normals.shape[0], data.normal.shape[0]
-    s = carve(buffer, N, 1, H, K, 0)
+    s = carve(buffer, N, A.shape[0], H, K, N if floor < COST_FLOOR else 0)
     for j in range(plants.shape[0]):
         begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
         hold_trim(A, s.trim, s.c)
+        begin_guess(floor, memories[j], s)
         has_plan = memories[j, 0] > 0.0
-        level, iterations = solve_within_model(
-            A, B, data.Q, data.R, data.P, stationary, s.r, has_plan, data, s, ws
-        )
+        level, iterations = solve_for_objective(A, B, data.P, stationary, has_plan, data, s, ws)
         end_row(level, plants[j], lasts[j], disturbances[j], memories[j], data, s, ws.u, commands[j], kept[j])
         left = left_model(level, s.x_0, ws.x, s.points, data.model_tilt, data.first_angle)
         report[0, j], report[1, j], report[2, j] = level, iterations, left
@@ -104,12 +105,21 @@ class LinearMPC(Mpc):
         super().__init__(task, options, options.velocity_reference, many_pairs=False, guess=False)
         self._data = self._data._replace(first_angle=ATTITUDE.start + 2)
         A, B = hover_pair(task.params, task.dt)
-        self._A, self._B = np.ascontiguousarray(A[None]), np.ascontiguousarray(B[None])
+        self._A, self._B = (np.repeat(matrix[None], self._pairs, axis=0) for matrix in (A, B))
+        self._stationary = not options.own_terminal and self._pairs == 1
 
     def _call(self, buffer: Array, ws: Workspace) -> _Call:
-        return _Call(self._A, self._B, not self.options.own_terminal, self._data, buffer, ws)
+        return _Call(self._A, self._B, self._stationary, self._floor, self._data, buffer, ws)
 
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
-        hold_trim(self._A, s.trim, s.c)
-        data, stationary = self._data, not self.options.own_terminal
-        return Problem(self._A, self._B, data.Q, data.R, data.P, stationary, s.r)
+        data = self._data
+        if number == 0:
+            hold_trim(self._A, s.trim, s.c)
+            begin_guess(self._floor, memory, s)
+        if s.floor[0] < COST_FLOOR:
+            weigh_about_guess(self._A, self._B, data.P, data, s)
+            return Problem(self._A, self._B, s.Q, s.R, s.P, False, s.r)
+        return Problem(self._A, self._B, data.Q, data.R, data.P, self._stationary, s.r)
+
+    def _accept(self, number: int, s: Scratch, ws: Workspace) -> bool:
+        return not (s.floor[0] < COST_FLOOR and refuses_plan(self._data, s, ws.x, ws.u))

@@ -45,6 +45,7 @@ from .kernels import (
     left_model,
 )
 from .options import PLAN_TILT, MpcOptions, VelocityAxes
+from .score import COST_FLOOR
 from .weights import change_weight, require_turnable, terminal_weight, weight_matrix
 
 PLAN_WEIGHT = 1e4  # per rad, rad/s: of rows that keep a plan in its model; 1e3 gives way to heavy positions
@@ -182,8 +183,15 @@ class Mpc(ABC):
         self.horizon = int(options.horizon)
         self.options = options
         self._data = mpc_data(task, options, axes)
+        self._floor = COST_FLOOR  # of the stage weights, see `score.weigh_stages`
+        if options.objective == "score":
+            self._floor = float(options.floor)
+            if self._data.own_rows > 0:  # a plan that flies to its limits has to know how late the rotors are
+                self._data = self._data._replace(lag=1.0 / task.params.rotor_rate)
+        weighs = self._floor < COST_FLOOR
+        many_pairs = many_pairs or (weighs and len(self._data.R_rate) > 0)  # as R_rate beside an R of each
         self._pairs = self.horizon if many_pairs else 1
-        self._guess_stages = self.horizon if guess else 0
+        self._guess_stages = self.horizon if guess or weighs else 0
         self._keep_from = (
             1 + MEMORY_STAGE * self.horizon + (ESTIMATOR_SIZE if options.reject_disturbance else 0)
         )

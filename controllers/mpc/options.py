@@ -136,7 +136,14 @@ class MpcOptions(VehicleMpcOptions):
         None  # rad/s, largest roll and pitch rate of a plan, half of it in yaw, likewise. None: 0.3 rad
         # a sample in frame "heading", inf in "hover"
     )
-
+    objective: Objective = (
+        "cost"  # what a plan minimises: the sum of the stage costs l, or what the score loses by them,
+        # l / (1 + l) of each stage, by weights 1 / (1 + l)^2 at the guess
+    )
+    floor: float = (
+        0.03  # least weight of a stage over the largest one with objective="score", in (0, 1]: less score and
+        # less cost the higher; 1 is the cost
+    )
     threads: int = (
         1  # threads that share the rows of a batch, more than one for many vehicles at once; decisions do not
         # depend on it. Of the solver "structured"
@@ -149,6 +156,12 @@ class MpcOptions(VehicleMpcOptions):
         require_whole("threads", self.threads, 1, MOST_THREADS)
         require_choice("solver", self.solver, SolverName)
         require_choice("frame", self.frame, Frame)
+        require_choice("objective", self.objective, Objective)
+        if not 0.0 < self.floor <= 1.0:
+            raise ValueError(
+                f"floor must lie in (0, 1], got {shown(self.floor)}; 1 weighs all stages alike, which is the "
+                "quadratic cost"
+            )
         for name, unit in (("plan_tilt", "rad"), ("plan_rate", "rad/s")):
             value = getattr(self, name)
             if value is not None and not value > 0.0:
@@ -248,25 +261,10 @@ class NmpcOptions(MpcOptions):
         # V_B - v_ref, v_ref turned by the present heading (frame "heading") or not (frame "hover")
     )
 
-    objective: Objective = (
-        "cost"  # what a plan minimises: the sum of the stage costs l, or what the score loses by them,
-        # l / (1 + l) of each stage, by weights 1 / (1 + l)^2 at the guess
-    )
-    floor: float = (
-        0.03  # least weight of a stage over the largest one with objective="score", in (0, 1]: less score and
-        # less cost the higher; 1 is the cost
-    )
-
     usual_tilt: ClassVar[float] = EXACT_TILT
 
     def __post_init__(self) -> None:
         require_whole("passes", self.passes, 1, MOST_PASSES)
-        require_choice("objective", self.objective, Objective)
-        if not 0.0 < self.floor <= 1.0:
-            raise ValueError(
-                f"floor must lie in (0, 1], got {shown(self.floor)}; 1 weighs all stages alike, which is the "
-                "quadratic cost"
-            )
         require_choice("velocity_error", self.velocity_error, VelocityError)
         MpcOptions.__post_init__(self)
 
@@ -275,7 +273,7 @@ class NmpcOptions(MpcOptions):
 class ScoreNmpcOptions(NmpcOptions):
     """What `ScoreNmpc` lets choose."""
 
-    objective: Objective = "score"  # what a plan minimises, as of `NmpcOptions`
+    objective: Objective = "score"  # what a plan minimises, as of `MpcOptions`
     margin: float = 0.024  # as of `MpcOptions`; at 0.022, one step in ten thousand exceeds a limit
 
 

@@ -94,13 +94,20 @@ def set_floor(floor: float, s: Scratch) -> None:
 
 
 @kernel
+def guess_loss(s: Scratch) -> float:
+    """What the guess is predicted to lose of the score, summed over its stages."""
+    total = 0.0
+    for i in range(s.loss.shape[0]):
+        total += score_loss(s.loss[i])
+    return total
+
+
+@kernel
 def loses_more(allowed: float, inertial: bool, data: MpcData, s: Scratch, x: Array, u: Array) -> bool:
     """Whether a plan made with weights of the score is predicted to lose `allowed` more than its guess."""
     if s.floor[0] >= COST_FLOOR:
         return False
-    before = allowed * s.loss.shape[0]
-    for i in range(s.loss.shape[0]):
-        before += score_loss(s.loss[i])
+    before = allowed * s.loss.shape[0] + guess_loss(s)
     return bool(predicted_loss(inertial, data, s, x, u) > before)
 
 

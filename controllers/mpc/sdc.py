@@ -26,11 +26,12 @@ from .kernels import (
     end_row,
     hold_trim,
     left_model,
-    solve_within_model,
 )
+from .linear_score import begin_guess, guess_plan, refuses_plan, solve_for_objective, weigh_about_guess
 from .mpc import Mpc, Problem
 from .options import SdcOptions, chosen
 from .present_axes import pair_in_present_axes, stop_turning
+from .score import COST_FLOOR
 
 _TILT_LIMIT = 1.4  # rad, of roll and pitch of the states at which the model is taken again
 
@@ -117,6 +118,15 @@ def relinearise(u: Array, alpha: float, present: bool, data: MpcData, s: Scratch
 
 
 @kernel
+def spread_pair(pairs: int, s: Scratch) -> None:
+    """The first of so many pairs for all of their stages."""
+    for i in range(1, pairs):
+        copy(s.A[0], s.A[i])
+        copy(s.B[0], s.B[i])
+        copy_vector(s.points[0], s.points[i])
+
+
+@kernel
 def leaves_pair(x: Array) -> bool:
     """Whether a plan (N+1, 12) rolls, pitches or yaws so far that the pair at its start no longer holds."""
     for i in range(1, x.shape[0]):
@@ -134,6 +144,7 @@ class _Call(NamedTuple):
     relinearisations: int  # passes after the first one, at most
     at_need: bool  # whether a further pass is made only where the plan needs it
     sdre_weight: bool  # whether the terminal weight is that of the present pair
+    floor: float  # of the stage weights, see `score.weigh_stages`
     data: MpcData
     buffer: Annotated[Array, "numbers"]
     ws: Workspace
@@ -156,26 +167,30 @@ def _decide_rows(
     words: IntArray,
 ) -> int:
     """One decision per row; -1, or the code of the first argument that is not finite."""
-    alpha, present, relinearisations, at_need, sdre_weight, data, buffer, ws = _unpack(words)
+    alpha, present, relinearisations, at_need, sdre_weight, floor, data, buffer, ws = _unpack(words)
     N = ws.u.shape[0]
     bad = first_non_finite(plants, windows, lasts, disturbances, memories, N + 1)
     if bad >= 0:
         return bad
-    pairs = N if relinearisations > 0 else 1
+    weighs = floor < COST_FLOOR
+    first = N if weighs and data.R_rate.shape[0] > 0 else 1  # pairs of the first pass
     H, K = data.normals.shape[0], data.normal.shape[0]
-    s = carve(buffer, N, pairs, H, K, 0)
+    s = carve(buffer, N, N if relinearisations > 0 else first, H, K, N if weighs else 0)
     for j in range(plants.shape[0]):
         begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
         worst, iterations = 0, 0
-        stationary = freeze_model(alpha, present, sdre_weight, data, s)
+        stationary = freeze_model(alpha, present, sdre_weight, data, s) and first == 1
+        spread_pair(first, s)
+        begin_guess(floor, memories[j], s)
         for k in range(1 + relinearisations):
-            pairs = 1
+            pairs = first
             if k > 0:
                 relinearise(ws.u, alpha, present, data, s)
+                guess_plan(floor, ws.u, s)
                 stationary, pairs = False, N
             has_plan = memories[j, 0] > 0.0
-            level, count = solve_within_model(
-                s.A[:pairs], s.B[:pairs], data.Q, data.R, s.P, stationary, s.r, has_plan, data, s, ws
+            level, count = solve_for_objective(
+                s.A[:pairs], s.B[:pairs], s.P, stationary, has_plan, data, s, ws
             )
             worst, iterations = max(worst, level), iterations + count
             if level > RELAXED or (at_need and not leaves_pair(ws.x)):
@@ -217,19 +232,36 @@ class SdcNmpc(Mpc):
         self._present = self._data.present
         self._at_need = options.at_need
         self._sdre_weight = options.terminal_weight == "sdre"
+        self._first = self.horizon if self._floor < COST_FLOOR and len(self._data.R_rate) > 0 else 1
+        self._refused, self._stationary, self._posed, self._taken = False, False, 1, 0  # see `_pose`
 
     def _call(self, buffer: Array, ws: Workspace) -> _Call:
         passes = self.relinearisations, self._at_need
-        return _Call(self.alpha, self._present, *passes, self._sdre_weight, self._data, buffer, ws)
+        given = self._sdre_weight, self._floor, self._data
+        return _Call(self.alpha, self._present, *passes, *given, buffer, ws)
 
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
-        stationary, pairs = False, 1
+        data = self._data
         if number == 0:
-            stationary = freeze_model(self.alpha, self._present, self._sdre_weight, self._data, s)
-        else:
-            relinearise(ws.u, self.alpha, self._present, self._data, s)
-            pairs = self.horizon
-        return Problem(s.A[:pairs], s.B[:pairs], self._data.Q, self._data.R, s.P, stationary, s.r)
+            self._taken = 0  # passes whose plan was taken
+            stationary = freeze_model(self.alpha, self._present, self._sdre_weight, data, s)
+            self._stationary = stationary and self._first == 1
+            spread_pair(self._first, s)
+            begin_guess(self._floor, memory, s)
+            self._posed = self._first
+        elif not self._refused:
+            relinearise(ws.u, self.alpha, self._present, data, s)
+            guess_plan(self._floor, ws.u, s)
+            self._stationary, self._posed = False, self.horizon
+        A, B = s.A[: self._posed], s.B[: self._posed]
+        if s.floor[0] < COST_FLOOR:
+            weigh_about_guess(A, B, s.P, data, s)
+            return Problem(A, B, s.Q, s.R, s.P, False, s.r)
+        return Problem(A, B, data.Q, data.R, s.P, self._stationary, s.r)
 
     def _accept(self, number: int, s: Scratch, ws: Workspace) -> bool:
-        return number == self.relinearisations or (self._at_need and not leaves_pair(ws.x))
+        self._refused = s.floor[0] < COST_FLOOR and refuses_plan(self._data, s, ws.x, ws.u)
+        if self._refused:
+            return False
+        self._taken += 1
+        return self._taken > self.relinearisations or (self._at_need and not leaves_pair(ws.x))
