@@ -134,6 +134,19 @@ def test_osqp_finds_the_same_plan(model):
             np.testing.assert_allclose(backend.solve(problem).u, exact.u, rtol=0.0, atol=1e-4)
 
 
+@pytest.mark.parametrize("first", ["one weight for all stages", "one of each stage"])
+def test_a_solver_serves_weights_of_each_stage_after_one_for_all(first):
+    """Its memory is divided by their number: what one problem left there must not count in the next."""
+    rng, N = np.random.default_rng(6), 6
+    one = with_rate(random_qp(rng, N, "ltv", "none"), rng)
+    one = one._replace(Q=one.Q[:1], R=one.R[:1], stationary=False)
+    each = one._replace(Q=np.repeat(one.Q, N, axis=0), R=np.repeat(one.R, N, axis=0))
+    problems = (one, each) if first == "one weight for all stages" else (each, one)
+    solver = StructuredSolver()
+    a, b = (solver.solve(problem).u for problem in problems)
+    np.testing.assert_allclose(a, b, rtol=0.0, atol=1e-9)
+
+
 @pytest.mark.parametrize("mpc", MPCS)
 def test_both_solvers_decide_alike(mpc):
     """OSQP stops at residuals of 1e-5, which is some 1e-3 N in the first input."""

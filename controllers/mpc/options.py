@@ -190,6 +190,7 @@ class LmpcOptions(MpcOptions):
         # "attitude": V_B, with v_ref turned into its axes; "heading": V_B, with v_ref as it is. Both move
         # positions by V_B: the longer the horizon, the more that costs
     )
+    floor: float = 0.1  # as of `MpcOptions`; far stages of a plan are predicted worse here, and need weight
 
     def __post_init__(self) -> None:
         MpcOptions.__post_init__(self)

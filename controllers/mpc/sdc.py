@@ -237,8 +237,8 @@ class SdcNmpc(Mpc):
 
     def _call(self, buffer: Array, ws: Workspace) -> _Call:
         passes = self.relinearisations, self._at_need
-        given = self._sdre_weight, self._floor, self._data
-        return _Call(self.alpha, self._present, *passes, *given, buffer, ws)
+        weights = self._sdre_weight, self._floor
+        return _Call(self.alpha, self._present, *passes, *weights, self._data, buffer, ws)
 
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
         data = self._data

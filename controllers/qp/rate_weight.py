@@ -132,6 +132,8 @@ def rate_pass(qp: OcpQp, w: RateWorkspace) -> None:
                 z.Q[i, n + a, n + b] = 0.5 * (RT[a, b] + RT[b, a])
     fill(z.Q_f, 0.0)
     copy(qp.Q_f, z.Q_f)
+    fill(z.c, 0.0)  # a problem with as many pairs but other weights may have left something here
+    fill(z.r, 0.0)
     copy(qp.c, z.c)
     copy(qp.r, z.r)
     for a in range(n):
