@@ -87,7 +87,8 @@ def controller_options_table() -> str:
     parents = dict.fromkeys((LmpcOptions, SdcOptions, NmpcOptions), MpcOptions)
     mpcs = (MpcOptions, *parents, CooperativeOptions, CentralOptions)
     for kind in (*mpcs, SdreOptions, LqrOptions, FeedbackLinearizationOptions):
-        shared = {field.name for field in fields(parents[kind])} if kind in parents else ()
+        shared = {field.name for field in fields(parents[kind])} if kind in parents else set()
+        shared -= set(kind.__annotations__)  # what it has otherwise
         values = {field.name: field.default for field in fields(kind) if field.name not in shared}
         lines += [f"#### {kind.__name__}", "", *_rows("option", values, field_comments(kind)), ""]
     return "\n".join(lines)

@@ -12,7 +12,7 @@ from baselines import ResultsError, load_suite, run_benchmark
 from baselines.policies.environments import make_env
 from baselines.sweeps.budget import budget_of
 from baselines.sweeps.choices import PolicyChoice, Tuning
-from baselines.sweeps.contenders import Contender, find_base, rank_of
+from baselines.sweeps.contenders import Contender, _kind, find_base, plans, rank_of
 from baselines.sweeps.folder import read_run
 from baselines.sweeps.protocol import require_disjoint_starts
 from baselines.sweeps.suite import BEST_MPC, Suite
@@ -20,7 +20,7 @@ from baselines.sweeps.units import suite_units, training_units
 from baselines.training.held_out import CHOOSING, HELD_OUT
 
 # A change of a definition is a new version: the numbers of two definitions do not compare.
-FROZEN = {"quad-bench-2026.1": "0999e04b6fdca861"}
+FROZEN = {"quad-bench-2026.1": "a4bc3fc90a07655c"}
 SHORT = {"time_limit": 1.0}
 SMALL = {
     "name": "small-bench",
@@ -71,16 +71,40 @@ def test_the_shipped_protocol_keeps_its_promises():
             seeds.setdefault((policy.contender, policy.envs), set()).add(policy.made.seed)
     assert set(map(frozenset, seeds.values())) == {frozenset(range(5))}
     levelled = [policy for policy in suite.policies if policy.tables == ("levelled",)]
-    assert {policy.made.seconds for policy in levelled} == {60}
-    tuned = [policy for policy in levelled if policy.tune is not None]
+    made = [policy for policy in levelled if policy.made is not None]
+    assert {policy.made.seconds for policy in made} == {60}
+    assert {policy.title for policy in levelled if policy not in made} == {"apg-generalist"}
+    tuned = [policy for policy in made if policy.tune is not None]
     assert tuned and {policy.tune.objective for policy in tuned} == {"score"}
+    for policy in tuned:  # score-nmpc does by itself
+        planned = "score" if policy.name in ("lmpc", "sdc-nmpc") else None
+        assert policy.kwargs.get("objective") == planned and policy.kwargs["reject_disturbance"]
     for env in suite.envs:  # the same conditions for all of a table
-        under = [policy.train_under for policy in suite.policies_in(env) if policy in levelled]
+        under = [policy.train_under for policy in suite.policies_in(env) if policy in made]
         assert under and all(each == under[0] for each in under)
     assert suite.episodes == 100 and suite.base == BEST_MPC
     whole, quick = budget_of(suite), budget_of(suite.quick())
     assert (whole.making + whole.flying) / 2 < 6 * 3600.0
     assert (quick.making + quick.flying) / 2 < 600.0
+
+
+def test_networks_as_derived_have_the_budgets_of_the_results_that_are_committed():
+    def budgets(suite, tables):
+        return {
+            (policy.name, policy.made.steps, policy.made.seconds)
+            for policy in suite.policies
+            if policy.train is not None and policy.tables == tables
+        }
+
+    committed = budgets(load_suite("rl-vs-mpc"), ())
+    assert len(committed) == 4 and budgets(load_suite("quad-bench-2026.1"), ("as derived",)) == committed
+
+
+def test_a_shipped_network_that_is_named_is_told_from_controllers():
+    suite = load_suite("quad-bench-2026.1")
+    policy = next(policy for policy in suite.policies if policy.name == "apg-generalist")
+    assert _kind(policy) == "model-based" and not plans(policy)
+    assert "Corridor" not in policy.envs and len(policy.envs) == 6
 
 
 @pytest.mark.parametrize("name", FROZEN)
@@ -327,6 +351,14 @@ def test_a_tuned_choice_flies_with_the_options_that_were_found():
     suite = load_suite(SMALL)
     assert all(unit.options == {} for unit in suite_units(suite) if unit.policy.made is not None)
     assert [unit.options for unit in suite_units(suite) if unit.policy.title == "R 0.1"] == [{"R": 0.1}]
+
+
+def test_a_budget_in_steps_is_estimated_by_what_steps_take():
+    def making(**budget):
+        policies = [{"name": "apg", "train": {"seeds": [0], **budget}}, "lmpc"]
+        return budget_of(load_suite(SMALL | {"policies": policies, "tables": []})).making
+
+    assert making(steps=450_000) == pytest.approx(making(seconds=10))
 
 
 def test_the_budget_is_said_before_anything_is_made():

@@ -71,6 +71,13 @@ def shipped_name(algorithm: str, env_id: str) -> str:
     return known[algorithm, env_id]
 
 
+def shipped_kind(name: str) -> str:
+    """What a shipped policy knows, as "model-based"; empty if none is called so."""
+    if not _is_shipped(name):
+        return ""
+    return str(json.loads((SHIPPED / name / _DESCRIPTION).read_text(encoding="utf-8"))["kind"])
+
+
 def names_trained(name: str | os.PathLike[str]) -> bool:
     """Whether a name can only be a trained policy: a path, something on disk, or a shipped name."""
     text = os.fspath(name)

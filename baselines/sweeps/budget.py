@@ -43,11 +43,14 @@ def budget_of(suite: Suite) -> Budget:
 
 
 def _making(unit: TrainingUnit) -> float:
-    """Where the budget is not in seconds, that of the algorithm stands for it."""
+    """Of a budget in steps what they take about; where there is none, that of the algorithm."""
     said = unit.made
     if said.seconds is not None:
         return said.seconds
-    return ALGORITHMS[unit.policy.name].seconds if isinstance(said, Training) else SECONDS
+    if not isinstance(said, Training):
+        return SECONDS
+    algorithm = ALGORITHMS[unit.policy.name]
+    return algorithm.seconds if said.steps is None else said.steps / algorithm.steps_per_second
 
 
 def _flying(units: Sequence[Unit]) -> float:

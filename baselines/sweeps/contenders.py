@@ -22,6 +22,7 @@ from ..evaluation.statistics import Comparison, Interval, compare, difference, m
 from ..evaluation.table import Table, printed_table
 from ..evaluation.team_metrics import flight_values
 from ..policies.registry import behind_filter, from_outside, is_mpc
+from ..policies.trained import shipped_kind
 from ..training.algorithms import ALGORITHMS
 from .choices import PolicyChoice
 from .suite import BEST_MPC, Suite
@@ -187,6 +188,9 @@ def _kind(policy: PolicyChoice) -> str:
     if policy.train is not None or policy.shipped:
         return ALGORITHMS[policy.name].kind
     name = behind_filter(policy.name)
+    known = shipped_kind(name)
+    if known:
+        return known
     return "outside" if ":" in name or from_outside(name) else "controller"
 
 

@@ -44,6 +44,9 @@ class Algorithm(NamedTuple):
     description: str
     seconds: float = 60.0  # default budget, CPU-seconds
     packages: tuple[str, ...] = ("torch",)  # modules that it imports
+    steps_per_second: float = (
+        45_000.0  # of the environments in a CPU-second, about: for estimates of time alone
+    )
     elsewhere: str = ""  # what to do where it cannot act, after a semicolon
 
 
@@ -65,6 +68,7 @@ ALGORITHMS: dict[str, Algorithm] = {
         (TRACKING, FORMATION, TARGET),
         "imitation of an MPC, labelled where the network flies",
         15.0,
+        steps_per_second=4_000.0,
     ),
     "mappo": Algorithm(
         ".central_critic",
