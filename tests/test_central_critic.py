@@ -101,7 +101,7 @@ def test_a_crash_ends_those_that_crashed_and_cuts_the_others():
     assert rewards[1] == 0.0 and (rewards[[0, 2]] > 0.0).all()
 
 
-def plain_advantages(buffer, last_values, dones, cuts, gamma, trace):
+def plain_advantages(buffer, rewards, last_values, dones, cuts, gamma, trace):
     """Generalised advantages of one row after another; `cuts` has (step, row) -> value of what was cut."""
     steps, rows = buffer.rewards.shape
     out = np.zeros((steps, rows))
@@ -112,29 +112,25 @@ def plain_advantages(buffer, last_values, dones, cuts, gamma, trace):
             then = last_values[row] if t == steps - 1 else buffer.values[t + 1, row]
             if ends:
                 then, following = cuts.get((t, row), 0.0), 0.0
-            delta = REWARDS[t][row] + gamma * then - buffer.values[t, row]
+            delta = rewards[t][row] + gamma * then - buffer.values[t, row]
             following = delta + gamma * trace * following
             out[t, row] = following
     return out
 
 
-REWARDS: list = []
-
-
 def test_advantages_are_those_of_a_plain_loop_over_vehicles(monkeypatch):
-    REWARDS.clear()
     options = replace(SMALL, log_std_init=0.0, n_steps=60, gamma=0.95, gae_lambda=0.9)
     flights = make_central_flights(TEAM, options, 1)
     model = make_mappo(flights, options, 1, lambda: 0.0)
-    ends, told, step = [], {}, type(flights).step_wait
+    ends, told, paid, step = [], {}, [], type(flights).step_wait
 
     def noted(self):
         seen, rewards, dones, infos = step(self)
         for row in np.flatnonzero(dones):
-            ends.append((len(REWARDS), int(row), bool(infos[row]["TimeLimit.truncated"])))
+            ends.append((len(paid), int(row), bool(infos[row]["TimeLimit.truncated"])))
             if infos[row]["TimeLimit.truncated"]:
-                told[len(REWARDS), int(row)] = infos[row]["terminal_observation"]
-        REWARDS.append(rewards.copy())
+                told[len(paid), int(row)] = infos[row]["terminal_observation"]
+        paid.append(rewards.copy())
         noted.last = seen, dones
         return seen, rewards, dones, infos
 
@@ -152,7 +148,7 @@ def test_advantages_are_those_of_a_plain_loop_over_vehicles(monkeypatch):
 
         cuts = {key: float(value(row)[0]) for key, row in told.items()}
         last = value(noted.last[0])
-    wanted = plain_advantages(model.rollout_buffer, last, noted.last[1], cuts, 0.95, 0.9)
+    wanted = plain_advantages(model.rollout_buffer, paid, last, noted.last[1], cuts, 0.95, 0.9)
     np.testing.assert_allclose(model.rollout_buffer.advantages.reshape(60, 6), wanted, rtol=1e-4, atol=1e-5)
 
 

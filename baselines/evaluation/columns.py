@@ -105,7 +105,7 @@ class Record(NamedTuple):
     z_error_rms: Annotated[
         float, Column("Height RMS", "m", "height error to the slot", LESS | TEAM | CUT_SHORT | UNSEEN)
     ]
-    messages: Annotated[float, Column("Messages", "/step", "heard per vehicle and step", TEAM)]
+    messages: Annotated[float, Column("Messages", "/step", "heard per vehicle and step", TEAM, "messages")]
     estimate_rmse: Annotated[
         float,
         Column(

@@ -22,6 +22,9 @@ class EnvChoice:
     id: str
     kwargs: dict[str, Any] = field(default_factory=dict)
     label: str = ""  # for tables; the id and the arguments if empty
+    tables: tuple[
+        str, ...
+    ] = ()  # labels of the tables of which alone policies fly in it; any policy if empty
 
     @property
     def title(self) -> str:
@@ -77,9 +80,15 @@ class Training:
     steps: int | None = None  # budget in environment steps,
     seconds: float | None = None  # or in CPU-seconds; the algorithm's own if neither
     hyper: dict[str, Any] = field(default_factory=dict)
+    start_from: str = ""  # shipped policy, or checkpoint, whose network it begins with; a new one if empty
 
     def __post_init__(self) -> None:
         require_whole("seed of a training in a suite", self.seed, 0)
+        if not isinstance(self.start_from, str):
+            raise ValueError(
+                "start_from of a training in a suite must be the name of a policy, got "
+                f"{shown(self.start_from)}"
+            )
 
     def part(self, divisor: float) -> Training:
         """With a small part of the budget."""
@@ -216,6 +225,11 @@ FIRST_PART = Part()  # of a suite that says nothing else
 def is_for(names: tuple[str, ...], env: EnvChoice) -> bool:
     """Whether a policy or condition that names these environments, or none, is for one."""
     return not names or env.id in names or env.title in names
+
+
+def flies_in(policy: PolicyChoice, env: EnvChoice) -> bool:
+    """Whether a policy is for an environment."""
+    return is_for(policy.envs, env) and (not env.tables or bool(set(env.tables) & set(policy.tables)))
 
 
 def _title(name: str, kwargs: Mapping[str, Any]) -> str:

@@ -206,7 +206,7 @@ def contender_rows(
     """
     rows: list[dict[str, Any]] = []
     for table in tables:
-        here = [one for one in contenders if table in ("", *one.tables) or not one.tables]
+        here = _of_table(contenders, table)
         rivals = _rivals(here, base)
         for one in here:
             rival = rivals[one.env, one.condition]
@@ -218,6 +218,14 @@ def contender_rows(
             rows.append(row)
         rows += [{"table": table, **row} for row in _over_all(here, rivals, base)]
     return rows
+
+
+def _of_table(contenders: Sequence[Contender], table: str) -> list[Contender]:
+    """Those that stand in a table; one that names none stands in all in which its environment is."""
+    if not table:
+        return list(contenders)
+    envs = {one.env for one in contenders if table in one.tables}
+    return [one for one in contenders if table in one.tables or (not one.tables and one.env in envs)]
 
 
 def _rivals(contenders: Sequence[Contender], base: str) -> dict[tuple[str, str], Contender]:

@@ -52,6 +52,7 @@ def _request(unit: TrainingUnit) -> TrainingRequest:
         out=unit.folder,
         env_kwargs=unit.env_kwargs,
         hyper=said.hyper,
+        start_from=said.start_from or None,
     )
 
 

@@ -25,6 +25,7 @@ from .choices import (
     Part,
     PolicyChoice,
     TableChoice,
+    flies_in,
     is_for,
     with_tuples,
 )
@@ -93,6 +94,7 @@ class Suite:
         singular = {"envs": "environment", "conditions": "condition", "tables": "table"}
         choices: list[tuple[str, Any]] = [(f"policy {one.title!r}", one) for one in self.policies]
         choices += [(f"condition {one.title!r}", one) for one in self.conditions]
+        choices += [(f"environment {one.title!r}", one) for one in self.envs]
         for who, choice in [*choices, ("the small part", self.small)]:
             for kind, names in known.items():
                 for name in getattr(choice, kind, ()):
@@ -110,7 +112,7 @@ class Suite:
 
     def policies_in(self, env: EnvChoice) -> list[PolicyChoice]:
         """Policies that are for an environment."""
-        return [policy for policy in self.policies if is_for(policy.envs, env)]
+        return [policy for policy in self.policies if flies_in(policy, env)]
 
     def flown(self, env: EnvChoice) -> dict[str, EnvChoice]:
         """Label of each condition that is for an environment -> what is flown; of none "" -> itself."""
@@ -133,6 +135,9 @@ class Suite:
     def digest(self) -> str:
         """Of all that is said here, but for the protocol of which it is a part."""
         said = {key: value for key, value in self.to_dict().items() if key != "definition"}
+        for holder, name in (*((env, "tables") for env in said["envs"]), *_trainings(said)):
+            if not holder[name]:  # as before it could be said
+                del holder[name]
         text = json.dumps(plain_json(said), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:_DIGITS]
 
@@ -153,7 +158,7 @@ class Suite:
         named = [one for one in conditions if one.label in small.conditions]
         kept = []
         for policy in self.policies:
-            if not any(is_for(policy.envs, env) for env in envs):
+            if not any(flies_in(policy, env) for env in envs):
                 continue
             key = f"{policy.contender} {policy.envs}"
             seen[key] = seen.get(key, 0) + 1
@@ -198,6 +203,9 @@ class Suite:
     ) -> Suite:
         """These of its parts, which name nothing that is no longer there."""
         tables = self.tables if tables is None else tables
+        asked = {one.label for one in tables}
+        envs = [env for env in envs if not env.tables or set(env.tables) & asked] or envs
+        tables = [one for one in tables if not self._elsewhere(one, envs)]
         places = {name for env in envs for name in (env.id, env.title)}
         labels = {one.label for one in conditions}
         tabled = {one.label for one in tables}
@@ -214,18 +222,24 @@ class Suite:
             }
             return replace(choice, **found)
 
-        kept = [cut(one) for one in policies if fits(one, "envs", places) and fits(one, "conditions", labels)]
+        meant = [one for one in policies if any(flies_in(one, env) for env in envs)]
+        kept = [cut(one) for one in meant if fits(one, "conditions", labels)]
         flown = [cut(one) for one in conditions if fits(one, "envs", places)]
         base = self.compare_with if self.compare_with in {BEST_MPC, *(one.title for one in kept)} else ""
         return replace(
             self,
-            envs=tuple(envs),
+            envs=tuple(map(cut, envs)),
             policies=tuple(kept),
             conditions=tuple(flown),
             tables=tuple(tables),
             small=cut_small(self.small, places, {one.label for one in flown}),
             compare_with=base,
         )
+
+    def _elsewhere(self, table: TableChoice, envs: Sequence[EnvChoice]) -> bool:
+        """Whether all policies that stand in a table are for other environments."""
+        there = [one for one in self.policies if table.label in one.tables]
+        return bool(there) and not any(flies_in(one, env) for one in there for env in envs)
 
     def to_dict(self) -> dict[str, Any]:
         """As plain values, the form of the TOML file."""
@@ -235,7 +249,7 @@ class Suite:
     def from_dict(cls, plain: Mapping[str, Any]) -> Suite:
         """What `to_dict` gave, unchecked: its policies may be folders that are no longer there."""
         parts = {
-            "envs": tuple(EnvChoice(**env) for env in plain["envs"]),
+            "envs": tuple(EnvChoice(**with_tuples(env, ("tables",))) for env in plain["envs"]),
             "policies": tuple(map(PolicyChoice.from_dict, plain["policies"])),
             "conditions": tuple(Condition(**with_tuples(one, ("envs",))) for one in plain["conditions"]),
             "tables": tuple(TableChoice(**one) for one in plain.get("tables", ())),
@@ -251,6 +265,11 @@ def cut_small(small: Part, envs: set[str], conditions: set[str]) -> Part:
         envs=tuple(name for name in small.envs if name in envs),
         conditions=tuple(name for name in small.conditions if name in conditions),
     )
+
+
+def _trainings(said: Mapping[str, Any]) -> list[tuple[dict[str, Any], str]]:
+    """The trainings in a suite as plain values, each with the key that says from what they go on."""
+    return [(policy["train"], "start_from") for policy in said["policies"] if policy["train"]]
 
 
 def _those(choices: Sequence[Any], wanted: Callable[[Any], bool]) -> list[Any]:

@@ -16,7 +16,7 @@ name = "mypolicy:make"       # module:factory of your own, or an entry point of 
 name = "safe:ppo-corridor"   # behind a safety filter
 [[policies]]
 name = "ppo"                 # an algorithm: one network is trained in each environment and with each seed
-train = {seeds = [0, 1, 2], steps = 4_000_000}
+train = {seeds = [0, 1, 2], steps = 4_000_000}   # start_from = "dagger-formation": goes on from that
 [[policies]]
 name = "ppo"                 # the network that comes with the suite
 shipped = true
@@ -30,6 +30,7 @@ kwargs = {kappa = 0.3125}
 
 "all" means the tracking ids, or policies. Multi-agent ids are named, and a policy that is not for all of the
 suite's environments says for which it is: `envs = ["quad/Formation-v0"]`, ids or labels. So do conditions.
+In an environment with `tables` fly policies of these tables alone: so teams stand beside single vehicles.
 Policies are compared within `tables` (label, about), if there are any: `tables = ["levelled"]` of a policy
 says in which it stands. `small` says what --quick keeps; `protocol` is the version that others repeat.
 """

@@ -3,8 +3,7 @@
 The actor sees what it will see in flight; the critic, needed in training only, sees the `state()` of the
 team beside that, each vehicle from its own point of view (Yu et al., 2022, call it agent-specific). Every
 vehicle has its own reward and its own advantage. A crash is the end for those that crashed: for the rest of
-their team it is a truncation, after which they have what the critic expects. Values are in units of a mean
-reward: the rewards are multiplied by 1 - gamma, so that a critic's error does not take all of the gradient.
+their team it is a truncation, after which they have what the critic expects.
 """
 
 from __future__ import annotations
@@ -106,26 +105,17 @@ class CentralEnv(TrainingVecEnv):
         options: Of the task.
         n: Number of teams.
         seed: See `TrainingVecEnv`.
-        gamma: Discount; rewards are multiplied by 1 - gamma.
         given: Of `TrainingVecEnv`.
     """
 
     _batch: TeamBatch
 
-    def __init__(
-        self, options: TeamOptions, n: int, seed: Any = 0, *, gamma: float = 0.99, **given: Any
-    ) -> None:
+    def __init__(self, options: TeamOptions, n: int, seed: Any = 0, **given: Any) -> None:
         super().__init__(options, n, seed, blame="agent", **given)
         assert isinstance(self.task, TeamTask)
         self._view = CriticView(self.task)
-        self._share = max(1.0 - gamma, 1.0 / self.task.episode_steps)
         size = self.encoder.size + self._view.size
         self.observation_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
-
-    def step_wait(self) -> tuple[Floats, Floats, Bools, list[dict[str, Any]]]:
-        """As of `TrainingVecEnv`, with rewards in units of a value."""
-        seen, rewards, dones, infos = super().step_wait()
-        return seen, rewards * np.float32(self._share), dones, infos
 
     def _see(
         self, observations: Floats, begins: Bools | None = None, rows: NDArray[np.int64] | None = None
@@ -232,11 +222,7 @@ def make_central_flights(
     task_options: TeamOptions, options: MappoOptions, seed: int, start: Network | None = None
 ) -> CentralEnv:
     """Teams to train on, see `sb3.make_flights`."""
-
-    def kind(*args: Any, **given: Any) -> CentralEnv:
-        return CentralEnv(*args, gamma=options.gamma, **given)
-
-    return flights_of(kind, task_options, options, seed, start)
+    return flights_of(CentralEnv, task_options, options, seed, start)
 
 
 def make_mappo(flights: CentralEnv, options: MappoOptions, seed: int, spent: Callable[[], float]) -> Any:

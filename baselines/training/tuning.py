@@ -18,7 +18,6 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import gymnasium
 import numpy as np
 
 from quad_envs.checks import require_choice, require_whole
@@ -218,9 +217,7 @@ class _Run:
         self.cma = _cma(search, mean, sigma, seed)
         if not request.resume:
             self._begin()
-        self.env: Any = gymnasium.make_vec(
-            request.env_id.removeprefix("quad_envs:"), num_envs=FLIGHTS, **dict(request.env_kwargs or {})
-        )
+        self.env = HeldOutFlights(request.env_id, dict(request.env_kwargs or {}), FLIGHTS).env
 
     def best(self) -> Point:
         """The best judged candidate."""
