@@ -2,12 +2,16 @@
 # make test   install the development extras and run ruff, mypy and the tests
 # make slow   the tests that take longer: dissertation tables, other solvers, long flights
 # make wheel  build a wheel into dist/ whose kernels are compiled: no wait at the first use (x86-64)
+# make sdist  build the source distribution into dist/: packages, tests and documentation
+# make check-release  both; install the wheel into a new environment far from here, and run all quick tests there
+#                     (TESTS="tests/test_spec.py" runs some)
 # make docs   build the documentation into site/
 # make extras resolve every extra with the pins of constraints.txt, and install nothing
 # make rllib  install RLlib into .venv-rllib (it pins an older gymnasium) and train a formation on a local Ray
 # make test-rllib  conformance with that gymnasium, and the example, in that environment
 # make ray    fly the quick benchmark on joblib's Ray backend, in the same environment
 PYTHON ?= python3
+TESTS ?=
 VENV ?= .venv
 RLLIB ?= .venv-rllib
 BIN := $(VENV)/bin
@@ -16,7 +20,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 
 EXTRAS := $(shell sed -n '/optional-dependencies/,/^\[project.scripts/s/^\([a-z]*\) = .*/\1/p' pyproject.toml)
 
-.PHONY: demo test slow wheel docs extras rllib test-rllib ray clean
+.PHONY: demo test slow wheel sdist check-release docs extras rllib test-rllib ray clean
 
 demo:
 	@test -e $(VENV)/installed || echo "install: into $(VENV), one to three minutes; then compile, about one, and fly"
@@ -40,6 +44,14 @@ wheel: $(VENV)/installed
 	cp build/portable/quad-envs/*.nbc quad_envs/kernels || true
 	$(PIP) wheel --no-deps -w dist . ; status=$$?; rm -rf quad_envs/kernels; exit $$status
 	@ls -sh dist/quad_envs-*.whl
+
+sdist: $(VENV)/installed
+	$(PIP) install -c constraints.txt build
+	rm -f dist/quad_envs-*.tar.gz
+	$(BIN)/python -m build --sdist --outdir dist .
+
+check-release: wheel sdist
+	.ci/check-release $(PYTHON) $(TESTS)
 
 docs: $(VENV)/installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict

@@ -1,4 +1,4 @@
-"""Cold starts: `python -m benchmarks.cold [POLICY ...] [--runs 5] [--compile] [--json]`.
+"""Cold starts: `python -m benchmarks.cold [POLICY ...] [--env ID] [--runs 5] [--compile] [--json]`.
 
 CPU-seconds from a new process to the first step, and to the first decision of each policy named; each process
 does one. Kernels are found where they are, in a folder of an earlier run or in the wheel: one run goes
@@ -14,6 +14,8 @@ import subprocess
 import sys
 import tempfile
 
+from quad_envs.registration import TEAMS
+
 from .timing import machine
 
 _FIRST = """
@@ -25,25 +27,39 @@ import numpy as np, gymnasium
 lap("numpy, gymnasium")
 import quad_envs
 lap("import")
-env = gymnasium.make("quad/HelixTracking-v0")
+policy, name, module = sys.argv[1:]
+if module:
+    import importlib
+    env = importlib.import_module(module).parallel_env()
+else:
+    env = gymnasium.make(name)
 lap("make")
-observation, _ = env.reset(seed=0)
+seen, _ = env.reset(seed=0)
 lap("reset")
-env.step(np.zeros(4, dtype=np.float32))
+if module:
+    env.step({agent: np.zeros(env.action_space(agent).shape, np.float32) for agent in env.agents})
+else:
+    env.step(np.zeros(4, dtype=np.float32))
 lap("step")
-if sys.argv[1]:
+if policy:
     from baselines import make_policy
-    make_policy(sys.argv[1], env).predict(observation[None])
+    decides = make_policy(policy, env)
+    if getattr(decides, "privileged", False):
+        seen = env.state()[None]
+    else:
+        seen = np.stack(list(seen.values())) if module else seen[None]
+    decides.predict(seen)
     lap("decision")
 print(json.dumps(laps))
 """
 
 
-def first(policy: str, runs: int, compile_anew: bool) -> dict[str, float]:
+def first(policy: str, env_id: str, runs: int, compile_anew: bool) -> dict[str, float]:
     """CPU-seconds of each part in the quickest run of several.
 
     Args:
         policy: Its name; "" for none.
+        env_id: Of the environment.
         runs: New processes.
         compile_anew: Whether the only run begins with an empty folder of kernels.
     """
@@ -51,7 +67,7 @@ def first(policy: str, runs: int, compile_anew: bool) -> dict[str, float]:
         changes = {"NUMBA_CACHE_DIR": empty} if compile_anew else {}
         laps = []
         for _ in range(1 if compile_anew else runs + 1):
-            command = [sys.executable, "-c", _FIRST, policy]
+            command = [sys.executable, "-c", _FIRST, policy, env_id, TEAMS.get(env_id, "")]
             done = subprocess.run(
                 command, env=os.environ | changes, stdout=subprocess.PIPE, text=True, check=True
             )
@@ -64,11 +80,13 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("policies", nargs="*")
+    parser.add_argument("--env", default="quad/HelixTracking-v0")
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--compile", action="store_true")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    found = {policy: first(policy, options.runs, options.compile) for policy in ["", *options.policies]}
+    asked = ["", *options.policies]
+    found = {policy: first(policy, options.env, options.runs, options.compile) for policy in asked}
     if options.json:
         print(json.dumps({"machine": machine(), "found": found}))
         return

@@ -97,6 +97,21 @@ def test_warm_says_where_the_kernels_are_and_fails_where_they_cannot_be_kept(mon
     assert "jobs must be a whole number >= 1, got 0" in capsys.readouterr().err
 
 
+def test_warm_compiles_safety_filters_and_random_vehicles_too(monkeypatch):
+    """Whoever installed the wheel would wait for them otherwise: no policy of the registry calls them."""
+    found = {}
+    monkeypatch.setattr(
+        compiling, "_compile", lambda pieces, *rest: found.update({p.title: p for p in pieces})
+    )
+    compiling.compile_everything()
+    piece = found["vehicles drawn at random"]
+    assert piece.unit.env.kwargs == {"randomize": 0.1}
+    piece.call(piece.unit)
+    piece = found["a safety filter"]
+    assert piece.unit.policy_name == "safe:hover"
+    piece.call(piece.unit)
+
+
 @pytest.mark.slow  # compiles an environment
 def test_what_two_processes_compile_nobody_compiles_again(tmp_path):
     code = (

@@ -15,6 +15,7 @@ import types
 from typing import NamedTuple
 
 import pytest
+from sources import ROOT, reads_sources
 
 from baselines.__main__ import main, make_parser
 from baselines.report.benchmark import BenchmarkRequest
@@ -26,7 +27,6 @@ from controllers.team.options import CentralOptions
 from quad_envs.field_comments import field_comments
 from quad_envs.registration import TEAMS, TRACKING
 
-ROOT = pathlib.Path(__file__).parent.parent
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
 QUICK = (
@@ -227,6 +227,7 @@ def test_every_link_and_picture_leads_to_a_file(page):
     assert missing == []
 
 
+@reads_sources
 @pytest.mark.parametrize("page", ["docs/chapters.md", "CONTRIBUTING.md"])
 def test_every_file_that_a_map_of_the_project_names_is_there(page):
     named = re.findall(r"`(\w+/[\w./]*)`", (ROOT / page).read_text(encoding="utf-8"))

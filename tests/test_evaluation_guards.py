@@ -1,17 +1,15 @@
 """What stands between a policy and its task: wrappers, names, and the models of Stable-Baselines3."""
 
-import pathlib
-
 import gymnasium as gym
 import numpy as np
 import pytest
+from sources import ROOT, reads_sources
 
 from baselines import EstimateWrapper, PolicyCheckError, check_policy, evaluate, make_policy
 from baselines.policies.pairing import JUDGED_ONLY
 from quad_envs import formation_v0, target_tracking_v0
 
 HELIX, FORMATION = "quad/HelixTracking-v0", "quad/Formation-v0"
-ROOT = pathlib.Path(__file__).parent.parent
 
 
 @pytest.mark.parametrize(
@@ -121,6 +119,7 @@ def test_a_mismatch_is_flown_on_purpose_where_the_observations_are_the_same():
         evaluate(policy, gym.make(HELIX, preview=30), episodes=1, mismatch=True)
 
 
+@reads_sources
 def test_no_controller_reads_a_field_of_the_task_that_need_not_agree():
     """What may differ between a policy's task and the flown one must not be read by any policy."""
     texts = [path.read_text(encoding="utf-8") for path in (ROOT / "controllers").rglob("*.py")]

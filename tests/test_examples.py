@@ -4,14 +4,13 @@ import subprocess
 import sys
 from importlib import import_module
 from importlib.util import find_spec
-from pathlib import Path
 
 import gymnasium as gym
 import pytest
+from sources import ROOT
 
 from quad_envs.registration import TRACKING
 
-ROOT = Path(__file__).parent.parent
 # What each needs beyond the suite, its arguments, and what it prints at its end.
 EXAMPLES = {
     "cleanrl_ppo": (["torch"], ["--steps", "16384"], "lmpc: score 0."),

@@ -1,11 +1,11 @@
 """Imports go one way: between packages, between the rooms of a package, and from file to file."""
 
 import ast
-import pathlib
 
 import pytest
+from sources import ROOT, reads_sources
 
-ROOT = pathlib.Path(__file__).parent.parent
+pytestmark = reads_sources
 LAYERS = ["quad_envs", "controllers", "baselines", "benchmarks"]
 # Rooms of a package from the ground up: a room imports from those before it.
 FLOORS = {

@@ -1,11 +1,10 @@
 """No loop takes over a name that stands for something else after it: reaching definitions of functions."""
 
 import ast
-import pathlib
 
 import pytest
+from sources import ROOT
 
-ROOT = pathlib.Path(__file__).parent.parent
 FOLDERS = ["quad_envs", "controllers", "baselines", "benchmarks", "examples", "tests"]
 FILES = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))]
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)

@@ -4,6 +4,8 @@ import sys
 from fnmatch import fnmatch
 from pathlib import Path
 
+from sources import PACKAGES, ROOT, reads_sources
+
 from quad_envs.compilation.portable import SHIPPED
 
 if sys.version_info >= (3, 11):
@@ -11,16 +13,16 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-ROOT = Path(__file__).parent.parent
 SETUPTOOLS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
 FILES = [
     path.relative_to(ROOT)
-    for package in ("quad_envs", "controllers", "baselines")
+    for package in PACKAGES
     for path in sorted((ROOT / package).rglob("*"))
     if path.is_file() and "__pycache__" not in path.parts and path.suffix != ".nbc"
 ]
 
 
+@reads_sources
 def test_every_folder_is_listed_so_that_setuptools_neither_warns_nor_leaves_it_out():
     folders = {path.parent for path in FILES} | {path.parent.parent for path in FILES} - {Path()}
     # Folders with other names, as those of the shipped policies, cannot be packages; they are data.
@@ -28,6 +30,7 @@ def test_every_folder_is_listed_so_that_setuptools_neither_warns_nor_leaves_it_o
     assert wanted == set(SETUPTOOLS["packages"])
 
 
+@reads_sources
 def test_every_file_that_is_no_code_is_named_as_data():
     data = {
         path
@@ -38,11 +41,22 @@ def test_every_file_that_is_no_code_is_named_as_data():
     assert [path for path in FILES if path.suffix != ".py" and ROOT / path not in data] == []
 
 
+@reads_sources
 def test_a_wheel_holds_the_kernels_that_make_wheel_compiles():
     place = SHIPPED.relative_to(ROOT)
     assert f"cp build/portable/quad-envs/*.nbc {place.as_posix()}" in (ROOT / "Makefile").read_text()
     file = (place / "a.nbc").relative_to("quad_envs").as_posix()
     assert any(fnmatch(file, pattern) for pattern in SETUPTOOLS["package-data"]["quad_envs"])
+
+
+def test_the_sdist_holds_whatever_the_project_holds():
+    """Packages, pyproject.toml, README and licence come by themselves; all else by MANIFEST.in."""
+    lines = (ROOT / "MANIFEST.in").read_text(encoding="utf-8").splitlines()
+    named = {word for line in lines if line.split()[0] in ("graft", "include") for word in line.split()[1:]}
+    named |= {*PACKAGES, "pyproject.toml", "README.md", "LICENSE", "MANIFEST.in"}
+    ignored = {line.strip("/") for line in (ROOT / ".gitignore").read_text(encoding="utf-8").splitlines()}
+    there = {path.name for path in ROOT.iterdir() if path.name not in (".git", "PKG-INFO", "setup.cfg")}
+    assert {name for name in there if not any(fnmatch(name, ours) for ours in ignored)} <= named
 
 
 def test_the_citation_names_this_version():

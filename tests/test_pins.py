@@ -3,11 +3,11 @@
 import re
 import sys
 from importlib import metadata
-from pathlib import Path
 
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
+from sources import ROOT, reads_sources
 
 from baselines.cli.doctor import EXTRAS
 from quad_envs.extras import install_command
@@ -17,7 +17,6 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 OPTIONAL = PROJECT["optional-dependencies"]
 NEWEST = {"python_version": "3.13", "python_full_version": "3.13.0"}  # where every pin holds
@@ -97,6 +96,7 @@ def test_no_message_and_no_page_names_a_package_that_is_not_published():
     assert [str(path) for path in texts if wrong.search(path.read_text(encoding="utf-8"))] == []
 
 
+@reads_sources
 def test_every_extra_that_a_message_names_exists():
     text = "".join(
         path.read_text(encoding="utf-8")

@@ -32,6 +32,7 @@ from .units import Unit
 
 _COMPILING = "numba:compile"  # numba's event
 _FEW_SECONDS = 0.2  # of flight, enough to call every kernel
+_LIMITED = "quad/CorridorTracking-v0"
 _LONG = 2.0  # s, from which a piece is worth a line of its own
 
 
@@ -80,7 +81,11 @@ def compile_everything(jobs: int | None = None) -> Path | None:
     units = [_unit(env_id, name) for env_id in (*TRACKING, *TEAMS) for name in _policies(env_id)]
     each = {unit.env.id: unit for unit in units}.values()
     whole = [Piece(f"{unit.env.id}, many and drawn", _step_many_and_draw, unit) for unit in each]
-    _compile([*_pieces(units), *whole], [], "everything", jobs)
+    rare = [
+        Piece("vehicles drawn at random", fly_unit, _unit(_LIMITED, "hover", randomize=0.1)),
+        Piece("a safety filter", _decide, _unit(_LIMITED, "safe:hover")),
+    ]
+    _compile([*_pieces(units), *rare, *whole], [], "everything", jobs)
     return kept_in()
 
 
@@ -92,9 +97,9 @@ def _policies(env_id: str) -> list[str]:
     return [*serving(mission), *shipped_for(env_id)[:1]]
 
 
-def _unit(env_id: str, policy: str) -> Unit:
+def _unit(env_id: str, policy: str, **kwargs: Any) -> Unit:
     """A flight as anybody flies it: a shorter one may have arguments of other types."""
-    return Unit(0, EnvChoice(env_id), PolicyChoice(policy), policy, 1, 0)
+    return Unit(0, EnvChoice(env_id, kwargs), PolicyChoice(policy), policy, 1, 0)
 
 
 def _short(unit: Unit) -> Unit:
