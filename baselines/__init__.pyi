@@ -34,6 +34,8 @@ from .report.single import evaluate as evaluate
 from .sweeps.comparison import Results as Results
 from .sweeps.suite import Suite as Suite
 from .sweeps.suite_files import load_suite as load_suite
+from .training.recording import Recorded as Recorded
+from .training.recording import record as record
 from .training.runs import TrainingResult as TrainingResult
 from .training.runs import train as train
 from .training.tuning import TuningResult as TuningResult

@@ -16,6 +16,7 @@ from .cli.options import (
     ExportOptions,
     ListOptions,
     Parser,
+    RecordOptions,
     ReplayOptions,
     ReportOptions,
     ReproduceOptions,
@@ -70,6 +71,12 @@ def _tune(options: TuneOptions) -> int:
     from .cli import tune as tune_command
 
     return tune_command.tune_one(options)
+
+
+def _record(options: RecordOptions) -> int:
+    from .cli import record as record_command
+
+    return record_command.record_flights(options)
 
 
 def _export(options: ExportOptions) -> int:
@@ -127,6 +134,7 @@ COMMANDS: dict[str, Command] = {
     "worker": Command(WorkerOptions, _worker),
     "train": Command(TrainOptions, _train),
     "tune": Command(TuneOptions, _tune),
+    "record": Command(RecordOptions, _record),
     "export": Command(ExportOptions, _export),
     "reproduce": Command(ReproduceOptions, _reproduce),
     "report": Command(ReportOptions, _report),

@@ -35,6 +35,7 @@ QUICK = (
     "docs/maths/sdc.md",
     "docs/tutorial/method.md",
 )  # run by default, the others are slow
+NEEDED = {"docs/tutorial/datasets.md": ("minari", "h5py")}  # packages that a page needs to run
 LANGUAGES = ("python", "bash", "toml", "csv", "text", "")  # "": text
 _FENCE = re.compile(r"^```(\w*)(?: title=\"([^\"]+)\")?\s*$")
 _MARK = re.compile(r"<!-- not run: .+ -->")
@@ -116,7 +117,10 @@ def read_command(words, where):
 
 @pytest.mark.parametrize("page", pages(has_something_to_run))
 def test_every_block_runs(page, tmp_path, monkeypatch):
+    for package in NEEDED.get(name_of(page), ()):
+        pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
     module = types.ModuleType("documented_page")  # a real one, so that its classes pickle
     monkeypatch.setitem(sys.modules, module.__name__, module)
     for block in blocks_of(page):

@@ -18,6 +18,7 @@ EXAMPLES = {
     "supersuit_sb3": (["supersuit", "stable_baselines3"], ["--steps", "1536"], "consensus-mpc: score 0."),
     "torchrl_ppo": (["torchrl"], ["--updates", "1"], "update 1: mean reward 0."),
     "rllib_formation": (["ray.rllib"], ["--iterations", "1", "--batch", "1000"], "1000 steps, score 0."),
+    "behaviour_cloning": (["minari", "h5py", "torch"], ["--record", "1", "--epochs", "1"], "crashes "),
     "gallery": ([], ["--only", "quad/Regulation-v0", "--out", "{tmp}"], "regulation.png, "),
     "animate_formation": ([], ["--steps", "8", "--out", "{tmp}/short.gif"], "3 frames in "),
     "your_own_filter": ([], [], "estimate_rmse"),
@@ -43,7 +44,8 @@ def run(name, *arguments):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_an_example_runs_to_its_end(name, tmp_path):
+def test_an_example_runs_to_its_end(name, tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     _, arguments, last = EXAMPLES[name]
     assert last in run(name, *(text.format(tmp=tmp_path) for text in arguments))
 

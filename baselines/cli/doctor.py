@@ -20,6 +20,7 @@ EXTRAS = {
     "video": ("moviepy",),
     "exact": ("casadi",),
     "lmi": ("cvxpy", "clarabel"),
+    "minari": ("minari", "h5py"),
     "ray": ("ray",),
     "dask": ("distributed",),
 }

@@ -23,6 +23,10 @@ _KINDS: dict[Any, type[Any]] = {
 }
 
 
+# What an option that may be repeated takes, where that is no name.
+_REPEATED = {"set": "KEY=VALUE", "policy_set": "KEY=VALUE", "hyper": "KEY=VALUE", "noise": "X"}
+
+
 class Positional(str):
     """Help text of an argument without a flag; the help text of a flag is a plain string."""
 
@@ -133,6 +137,31 @@ class TuneOptions:
     )
     resume: Annotated[bool, "go on with the search in the folder"] = False
     fresh: Annotated[bool, "discard the search that is in the folder"] = False
+    json: Annotated[bool, "print JSON"] = False
+
+
+@dataclass(frozen=True, slots=True)
+class RecordOptions:
+    """Fly, and leave the flights as a Minari dataset for offline learning."""
+
+    env: Annotated[str, Positional("environment id of one vehicle, as quad/CorridorTracking-v0")]
+    policy: Annotated[
+        list[str],
+        Positional("policy, as nmpc, or several, which fly one after the other: a mixed dataset"),
+    ] = field(default_factory=list)
+    minari: Annotated[str, "of the dataset, as quad/corridor/expert-v0"] = ""
+    episodes: Annotated[int, "flights of each policy"] = 50
+    seed: Annotated[int, "environment seed of the first flight"] = 0
+    noise: Annotated[
+        list[str],
+        "standard deviation of noise on actions in -1 to 1; repeated, one for each policy",
+    ] = field(default_factory=list)
+    set: Annotated[list[str], "keyword argument of the environment; JSON, {key: value}, or text"] = field(
+        default_factory=list
+    )
+    policy_set: Annotated[list[str], "option of the policy; JSON, {key: value}, or text"] = field(
+        default_factory=list
+    )
     json: Annotated[bool, "print JSON"] = False
 
 
@@ -255,7 +284,7 @@ def add_options(parser: argparse.ArgumentParser, kind: type[Any]) -> None:
         elif many:
             settings |= {
                 "action": "append",
-                "metavar": "NAME" if entry.name in ("policy", "tuned", "only") else "KEY=VALUE",
+                "metavar": _REPEATED.get(entry.name, "NAME"),
             }
         elif hint is not bool:
             settings["metavar"] = {int: "N", float: "S", Path: "FOLDER"}.get(settings["type"], "NAME")
