@@ -12,7 +12,7 @@ pytest.importorskip("stable_baselines3")
 
 import torch
 
-from baselines import evaluate, train
+from baselines import evaluate, make_policy, train
 from baselines.policies.environments import make_env
 from baselines.policies.network import NetworkPolicy
 from baselines.training import central_critic
@@ -26,6 +26,8 @@ from quad_envs.envs.tracking.options import TrackingOptions
 
 TEAM = FormationOptions(vehicles=3, time_limit=2.0)
 SMALL = MappoOptions(n_envs=6, n_steps=24, batch_size=48, n_epochs=2, net_arch=(16,), critic_arch=(24, 8))
+FORMATION = "quad/Formation-v0"
+LIKE = {"net_arch": [128, 128], "stages": [0, 2, 5]}
 TURN_OVER = np.array([0.9, -0.9, -0.9, 0.9], dtype=np.float32)
 
 
@@ -171,8 +173,8 @@ def test_equal_seeds_give_equal_actors_and_a_start_is_kept_while_the_critic_lear
 def test_a_trained_folder_is_a_checkpoint_as_any_other(tmp_path):
     small = {"n_envs": 6, "n_steps": 8, "net_arch": [8], "critic_arch": [8]}
     team = {"vehicles": 3, "formation": "triangle", "time_limit": 1.0}
-    train("quad/Formation-v0", "mappo", steps=96, out=tmp_path / "run", env_kwargs=team, hyper=small)
-    env = make_env("quad/Formation-v0", **team)
+    train(FORMATION, "mappo", steps=96, out=tmp_path / "run", env_kwargs=team, hyper=small)
+    env = make_env(FORMATION, **team)
     assert len(evaluate(str(tmp_path / "run"), env, 2, 7).records) == 2 * 3
 
 
@@ -192,18 +194,43 @@ def test_one_vehicle_is_refused_with_the_remedy(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.filterwarnings("ignore:the union of the graphs")
+@pytest.mark.parametrize("algorithm", ["mappo", "ppo"])
+@pytest.mark.parametrize(
+    ("env_id", "team", "hyper", "start", "message"),
+    [
+        ("quad/TargetTracking-v0", {"detection": 0.0}, {}, None, r"nobody measures.*let somebody measure"),
+        (FORMATION, {"graph": "complete"}, LIKE, "dagger-formation", r"'comm'.*choose a graph in which"),
+        (FORMATION, {"sensed": 2}, LIKE, "dagger-formation", r"'sensed'.*pass sensed=5"),
+        (FORMATION, {}, {"net_arch": [8]}, "dagger-formation", r"give the same net_arch"),
+        (FORMATION, {}, LIKE, "apg-helix", r"cannot go on from a network that sees"),
+    ],
+)
+def test_what_cannot_be_trained_in_a_team_is_refused_before_anything_is_written(
+    tmp_path, algorithm, env_id, team, hyper, start, message
+):
+    with pytest.raises(ValueError, match=message):
+        train(env_id, algorithm, out=tmp_path / "run", env_kwargs=team, hyper=hyper, start_from=start)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_network_that_sees_more_vehicles_names_the_argument():
+    with pytest.raises(ValueError, match=r"the network sees sensed\[2\]\[0\].*pass sensed=5, or more"):
+        make_policy("dagger-formation", make_env(FORMATION, sensed=2))
+
+
 def test_a_critic_without_end_is_refused():
     with pytest.raises(ValueError, match=r"a layer of hyperparameter critic_arch"):
-        train("quad/Formation-v0", "mappo", hyper={"critic_arch": [10**9]})
+        train(FORMATION, "mappo", hyper={"critic_arch": [10**9]})
 
 
 @pytest.mark.slow
 def test_it_learns_to_hold_a_triangle():
-    task = training_options("quad/Formation-v0", {"vehicles": 3, "formation": "triangle"})
-    options, done = hyperparameters("mappo", "quad/Formation-v0"), iter(range(10**6))
+    task = training_options(FORMATION, {"vehicles": 3, "formation": "triangle"})
+    options, done = hyperparameters("mappo", FORMATION), iter(range(10**6))
     *_, (_, network) = itertools.islice(
         central_critic.train(task, options, 0, lambda: min(next(done) / 1e4, 0.99)), 60
     )
-    env = make_env("quad/Formation-v0", vehicles=3, formation="triangle")
+    env = make_env(FORMATION, vehicles=3, formation="triangle")
     found = evaluate(NetworkPolicy(network, env.unwrapped.task, "mappo"), env, 5, 10_000)
     assert found.summary()["score"].mean > 0.3  # before training 0.02

@@ -79,7 +79,8 @@ ALGORITHMS: dict[str, Algorithm] = {
         "proximal policy optimisation with a critic that sees the whole team",
         150.0,
         _SB3,
-        "its critic sees the state() of a team, which one vehicle has not: take ppo",
+        steps_per_second=37_000.0,
+        elsewhere="its critic sees the state() of a team, which one vehicle has not: take ppo",
     ),
     "ppo": Algorithm(
         ".sb3",

@@ -26,6 +26,7 @@ from quad_envs.plant import Array
 from quad_envs.tasks import TeamTask
 
 from ..policies.network import Floats, Network
+from . import sb3
 from .algorithm_options import MappoOptions
 from .held_out import Progress
 from .learner import Tanh
@@ -178,13 +179,14 @@ def check(task_options: TaskOptions, options: MappoOptions, start: Network | Non
     """Refuse what `train` would, before anything is written.
 
     Raises:
-        ValueError: If the task is of one vehicle, or has no rotor commands.
+        ValueError: If the task is of one vehicle; see `sb3.check`.
     """
     if not isinstance(task_options, TeamOptions):
         raise ValueError(
             f"mappo needs the state() of a team for its critic, and {task_options.env_id} is flown by one "
             "vehicle: train with ppo, or take quad/Formation-v0"
         )
+    sb3.check(task_options, options, start)
 
 
 def train(
@@ -210,7 +212,7 @@ def train(
         ValueError: See `check`; or `start` has other layers.
         TrainingError: If a loss or a weight is not finite.
     """
-    check(task_options, options, start)
+    check(task_options, options)
     if start is not None:
         rate = options.start_learning_rate
         options = replace(options, log_std_init=options.start_log_std, learning_rate=rate)

@@ -27,7 +27,8 @@ from quad_envs.wrappers.encoded_space import stages_of
 from ..errors import TrainingError
 from ..policies.network import Network
 from .algorithm_options import PpoLagrangianOptions, PpoOptions, SacOptions
-from .features import training_features
+from .beginning import require_continuable
+from .features import require_measured, training_features
 from .held_out import Progress
 from .lagrangian import LagrangianBuffer, LagrangianEnv, Multiplier, Probe
 from .learner import RowBuffer, RowPPO, Tanh
@@ -36,6 +37,20 @@ from .vec_env import TaskOptions, TrainingVecEnv
 F = TypeVar("F", bound=TrainingVecEnv)
 _PROBES = 500_000_009  # from the seed of training to that of the flights which measure violations
 _NEVER = 2**31  # updates between logs of stable-baselines3; runs keep their own
+
+
+def check(task_options: TaskOptions, options: PpoOptions | SacOptions, start: Network | None = None) -> None:
+    """Refuse in a team what training would, before anything is written.
+
+    Raises:
+        ValueError: If nobody measures a target, or training cannot go on from `start`.
+    """
+    if not isinstance(task_options, TeamOptions):
+        return
+    require_measured(task_options)
+    if start is not None:
+        features = training_features(task_options, options.stages)
+        require_continuable(start, features, options.net_arch, 4, "clip")
 
 
 def train_ppo(

@@ -12,6 +12,8 @@ from .tracking import N_REFERENCE, TrackingLayout
 
 # Preview stages that a network sees: near ones densely, the horizon of the MPCs at the end.
 TRACKING_STAGES = (0, 1, 2, 3, 5, 7, 10, 14, 19, 25)
+# Part -> argument of the environment that says how many rows it has, and by how much it exceeds the last row.
+_ARGUMENTS = {"preview": ("preview", 0), "comm": ("neighbours", 1), "sensed": ("sensed", 1)}
 PLACES = ("observation[0]",)  # how names of places begin, see `Features`
 # Typical size of each part, so that a network sees numbers of order one.
 _SCALES = {
@@ -68,9 +70,20 @@ class Features:
         if missing:
             raise ValueError(
                 f"the network sees {missing[0]} (and {len(missing) - 1} more), which observations here "
-                "lack: evaluate it in a task with the layout it was trained on (preview, limits, slots)"
+                "lack: evaluate it in a task with the layout it was trained on "
+                f"({_remedy(missing[0], self.names)})"
             )
         return np.array([known[name] for name in self.names], dtype=np.int64)
+
+
+def _remedy(name: str, names: tuple[str, ...]) -> str:
+    """How an environment comes to show an entry, where an argument says how many there are."""
+    part = name.partition("[")[0]
+    if part not in _ARGUMENTS:
+        return "preview, limits, slots"
+    argument, beyond = _ARGUMENTS[part]
+    last = max(int(one.split("[")[1].rstrip("]")) for one in names if one.startswith(f"{part}["))
+    return f"pass {argument}={last + beyond}, or more"
 
 
 def part_shapes(layout: TrackingLayout | AgentLayout) -> dict[str, tuple[int, ...]]:
