@@ -186,9 +186,12 @@ class Mpc(ABC):
         self._floor = COST_FLOOR  # of the stage weights, see `score.weigh_stages`
         if options.objective == "score":
             self._floor = float(options.floor)
-            if self._data.own_rows > 0:  # a plan that flies to its limits has to know how late the rotors are
-                self._data = self._data._replace(lag=1.0 / task.params.rotor_rate)
         weighs = self._floor < COST_FLOOR
+        limited = self._data.own_rows > 0 or math.isfinite(self._data.rate_step)
+        if weighs and (limited or not guess):
+            # A plan that flies to its limits has to know how late the rotors are, and so has a linear model,
+            # which makes up for no other error by iterating.
+            self._data = self._data._replace(lag=1.0 / task.params.rotor_rate)
         many_pairs = many_pairs or (weighs and len(self._data.R_rate) > 0)  # as R_rate beside an R of each
         self._pairs = self.horizon if many_pairs else 1
         self._guess_stages = self.horizon if guess or weighs else 0
