@@ -5,6 +5,8 @@
 # make sdist  build the source distribution into dist/: packages, tests and documentation
 # make check-release  both; install the wheel into a new environment far from here, and run all quick tests there
 #                     (TESTS="tests/test_spec.py" runs some)
+# make test-matrix  the quick tests on every Python that is supported, found as python3.X, and on the lowest versions
+#                   of all dependencies (VERSIONS="3.10 lowest" runs some, TESTS="..." some tests)
 # make docs   build the documentation into site/
 # make extras resolve every extra with the pins of constraints.txt, and install nothing
 # make rllib  install RLlib into .venv-rllib (it pins an older gymnasium) and train a formation on a local Ray
@@ -20,7 +22,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 
 EXTRAS := $(shell sed -n '/optional-dependencies/,/^\[project.scripts/s/^\([a-z]*\) = .*/\1/p' pyproject.toml)
 
-.PHONY: demo test slow wheel sdist check-release docs extras rllib test-rllib ray clean
+.PHONY: demo test slow test-matrix wheel sdist check-release docs extras rllib test-rllib ray clean
 
 demo:
 	@test -e $(VENV)/installed || echo "install: into $(VENV), one to three minutes; then compile, about one, and fly"
@@ -36,6 +38,9 @@ test: $(VENV)/installed-dev
 
 slow: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m slow
+
+test-matrix:
+	.ci/test-matrix $(TESTS)
 
 wheel: $(VENV)/installed
 	rm -rf build quad_envs/kernels dist/quad_envs-*.whl
@@ -90,4 +95,4 @@ $(VENV)/installed-docs: $(VENV)/installed
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(RLLIB) site build *.egg-info
+	rm -rf $(VENV) $(RLLIB) .venv-matrix site build *.egg-info

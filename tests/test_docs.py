@@ -6,6 +6,7 @@ is only read: Python is compiled, commands are parsed. Of the README the command
 """
 
 import importlib.util
+import json
 import pathlib
 import re
 import shlex
@@ -28,6 +29,7 @@ from quad_envs.field_comments import field_comments
 from quad_envs.registration import TEAMS, TRACKING
 
 README = ROOT / "README.md"
+NOTEBOOK = ROOT / "docs" / "tutorial" / "first_flight.ipynb"
 PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
 QUICK = (
     "docs/extending.md",
@@ -112,7 +114,9 @@ def read_command(words, where):
     elif words[:2] == ["python", "-m"]:
         assert importlib.util.find_spec(words[2]), where
     else:
-        assert words[0] in ("pip", "tensorboard", "git", "cd"), f"{where}: nothing tests {words[0]!r}"
+        assert words[0] in ("pip", "tensorboard", "git", "cd", "docker"), (
+            f"{where}: nothing tests {words[0]!r}"
+        )
 
 
 @pytest.mark.parametrize("page", pages(has_something_to_run))
@@ -137,6 +141,22 @@ def test_every_block_runs(page, tmp_path, monkeypatch):
                     f"{name_of(page)}, line {block.line}: mark {words[0]} as not run"
                 )
                 assert main(words[1:]) == 0, shlex.join(words)
+
+
+def test_every_cell_of_the_notebook_runs_and_no_output_is_stored(monkeypatch):
+    pyplot = pytest.importorskip("matplotlib.pyplot", reason="the notebook needs the extra [report]")
+    notebook = json.loads(NOTEBOOK.read_text(encoding="utf-8"))
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert notebook["nbformat"] == 4 and len(cells) > 3
+    module = types.ModuleType("documented_notebook")
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    with pyplot.rc_context({"backend": "agg"}):
+        for cell in cells:
+            assert cell["outputs"] == [] and cell["execution_count"] is None, "clear the outputs"
+            exec(compile("".join(cell["source"]), cell["id"], "exec"), module.__dict__)
+    pyplot.close("all")
+    costs = {name: found.summary()["constraint_cost"].mean for name, found in module.found.items()}
+    assert costs["nmpc"] == 0.0 < costs["ppo-corridor"]  # as the text says
 
 
 def test_every_page_is_in_the_navigation_and_every_entry_of_it_is_a_page():

@@ -59,6 +59,17 @@ def test_the_sdist_holds_whatever_the_project_holds():
     assert {name for name in there if not any(fnmatch(name, ours) for ours in ignored)} <= named
 
 
+def test_the_image_is_made_and_runs_with_one_python_that_is_supported_and_tested():
+    """Kernels of a wheel are those of one Python: another one would compile its own."""
+    lines = (ROOT / "Dockerfile").read_text(encoding="utf-8").splitlines()
+    images = [line.split()[1] for line in lines if line.startswith("FROM")]
+    assert len(images) == 2 and len(set(images)) == 1
+    version = images[0].removeprefix("python:").removesuffix("-slim")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert f"Programming Language :: Python :: {version}" in project["classifiers"]
+    assert 'ENTRYPOINT ["quad-envs"]' in lines and "quad-envs" in project["scripts"]
+
+
 def test_the_citation_names_this_version():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
