@@ -22,6 +22,7 @@ EXAMPLES = {
     "gallery": ([], ["--only", "quad/Regulation-v0", "--out", "{tmp}"], "regulation.png, "),
     "animate_formation": ([], ["--steps", "8", "--out", "{tmp}/short.gif"], "3 frames in "),
     "your_own_filter": ([], [], "estimate_rmse"),
+    "your_own_team_learner": (["torch"], ["--steps", "16384"], "consensus-mpc: score 0."),
     "your_own_task": ([], ["--episodes", "1"], "sdc-nmpc on quad/HelixTracking-v0"),
 }
 
