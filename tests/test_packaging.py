@@ -1,11 +1,13 @@
 """What a wheel holds: every file of the packages, by the lists of pyproject.toml."""
 
+import re
 import sys
 from fnmatch import fnmatch
 from pathlib import Path
 
 from sources import PACKAGES, ROOT, reads_sources
 
+import quad_envs
 from quad_envs.compilation.portable import SHIPPED
 
 if sys.version_info >= (3, 11):
@@ -70,8 +72,14 @@ def test_the_image_is_made_and_runs_with_one_python_that_is_supported_and_tested
     assert 'ENTRYPOINT ["quad-envs"]' in lines and "quad-envs" in project["scripts"]
 
 
-def test_the_citation_names_this_version():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+def test_the_citation_and_the_changelog_name_this_version_and_its_day():
+    """Both are read by people without a build, so they cannot be computed; the package's is computed."""
+    table = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    assert table["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "quad_envs.__version__"}
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
-    for name in ("version", "license"):
-        assert f"\n{name}: {project[name]}\n" in citation
+    license_name, version = table["project"]["license"], quad_envs.__version__
+    assert f"\nversion: {version}\n" in citation and f"\nlicense: {license_name}\n" in citation
+    (day,) = re.findall(r"^date-released: (\S+)$", citation, re.MULTILINE)
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    newest = next(head for head in re.findall(r"^## (.+)$", changelog, re.MULTILINE) if head != "Unreleased")
+    assert newest == f"{version} - {day}"
