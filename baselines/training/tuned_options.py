@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from controllers.mpc.options import MpcOptions
 from quad_envs.names import unknown_name
 from quad_envs.parameters import Array
 from quad_envs.tasks import Task, TeamTask
@@ -48,6 +49,10 @@ def _share(z: Array, task: AnyTask, default: Any) -> float:
     return min(1.0, float((0.5 if default == "auto" else default) * 10.0 ** z[0]))
 
 
+def _floor(z: Array, task: AnyTask, default: Any) -> float:
+    return _share(z, task, MpcOptions(floor=default).least_weight(task.limits))
+
+
 def _change_weight(z: Array, task: AnyTask, default: Any) -> float:
     return float(10.0 ** (z[0] - 2.0) if default is None else default * 10.0 ** z[0])
 
@@ -64,7 +69,7 @@ KNOBS: dict[str, Knob] = {
     "terminal": Knob(1, _positive),
     "margin": Knob(1, _positive, lambda task, options: len(task.constraint_names) > 0),
     "estimator_gain": Knob(1, _share, lambda task, options: options["reject_disturbance"]),
-    "floor": Knob(1, _share, lambda task, options: options["objective"] == "score"),
+    "floor": Knob(1, _floor, lambda task, options: options["objective"] == "score"),
     "horizon": Knob(1, _samples, lambda task, options: False),
 }
 

@@ -185,7 +185,7 @@ class Mpc(ABC):
         self._data = mpc_data(task, options, axes)
         self._floor = COST_FLOOR  # of the stage weights, see `score.weigh_stages`
         if options.objective == "score":
-            self._floor = float(options.floor)
+            self._floor = options.least_weight(task.limits)
         weighs = self._floor < COST_FLOOR
         limited = self._data.own_rows > 0 or math.isfinite(self._data.rate_step)
         if weighs and (limited or not guess):

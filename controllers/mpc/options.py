@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quad_envs.checks import require_choice, require_whole
+from quad_envs.limits import Limits
 from quad_envs.names import shown, unknown_name
 
 from ..controller import MOST_PASSES, require_horizon
@@ -32,6 +33,8 @@ TerminalWeight = Literal["hover", "sdre"]
 PLAN_TILT = 0.8  # rad, of models linear in the attitude
 PLAN_TURN = 0.3  # rad, of roll and pitch from sample to sample
 EXACT_TILT = 1.0  # rad, of the exact model
+FLOOR = 0.03  # of the weights of the score, and
+LIMITED_FLOOR = 0.1  # where the state is limited: a plan that saves its score for later meets a wall there
 MOST_THREADS = 1024
 SOFT_WEIGHT = 25.0  # per SI unit: keeps the corridor's limits; from 30 on, 3 m outside walls, some flip
 
@@ -140,9 +143,9 @@ class MpcOptions(VehicleMpcOptions):
         "cost"  # what a plan minimises: the sum of the stage costs l, or what the score loses by them,
         # l / (1 + l) of each stage, by weights 1 / (1 + l)^2 at the guess
     )
-    floor: float = (
-        0.03  # least weight of a stage over the largest one with objective="score", in (0, 1]: less score and
-        # less cost the higher; 1 is the cost
+    floor: float | None = (
+        None  # least weight of a stage over the largest one with objective="score", in (0, 1]: less score and
+        # less cost the higher; 1 is the cost. None: 0.03, and 0.1 where the task limits the state
     )
     threads: int = (
         1  # threads that share the rows of a batch, more than one for many vehicles at once; decisions do not
@@ -157,7 +160,7 @@ class MpcOptions(VehicleMpcOptions):
         require_choice("solver", self.solver, SolverName)
         require_choice("frame", self.frame, Frame)
         require_choice("objective", self.objective, Objective)
-        if not 0.0 < self.floor <= 1.0:
+        if self.floor is not None and not 0.0 < self.floor <= 1.0:
             raise ValueError(
                 f"floor must lie in (0, 1], got {shown(self.floor)}; 1 weighs all stages alike, which is the "
                 "quadratic cost"
@@ -172,6 +175,12 @@ class MpcOptions(VehicleMpcOptions):
         if self.plan_tilt is not None:
             return self.plan_tilt
         return self.usual_tilt if self.frame == "heading" else math.inf
+
+    def least_weight(self, limits: Limits) -> float:
+        """The floor of the weights of the score: as chosen, else the usual one under these limits."""
+        if self.floor is not None:
+            return float(self.floor)
+        return LIMITED_FLOOR if np.isfinite(limits.state_box()).any() else FLOOR
 
     def largest_rate(self, dt: float) -> float:
         """The rate that a plan keeps to, rad/s: as chosen, else `PLAN_TURN` a sample; cf. `largest_tilt`."""
@@ -190,7 +199,7 @@ class LmpcOptions(MpcOptions):
         # "attitude": V_B, with v_ref turned into its axes; "heading": V_B, with v_ref as it is. Both move
         # positions by V_B: the longer the horizon, the more that costs
     )
-    floor: float = 0.1  # as of `MpcOptions`; far stages of a plan are predicted worse here, and need weight
+    floor: float | None = 0.1  # as of `MpcOptions`; far stages are predicted worse here, and need weight
 
     def __post_init__(self) -> None:
         MpcOptions.__post_init__(self)
@@ -275,7 +284,6 @@ class ScoreNmpcOptions(NmpcOptions):
     """What `ScoreNmpc` lets choose."""
 
     objective: Objective = "score"  # what a plan minimises, as of `MpcOptions`
-    margin: float = 0.024  # as of `MpcOptions`; at 0.022, one step in ten thousand exceeds a limit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
