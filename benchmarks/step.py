@@ -34,6 +34,8 @@ _STEPS = 1000  # control steps of a single environment in one call
 _DT = 0.05  # s
 _EPISODE = 201  # control steps of an episode and its reset
 _ROWS = 1024  # flights with which options are measured
+_L2F_SINGLE = {"l2f: one, step + observe": False, "l2f: one, and read it, and go on": True}
+_L2F_ROWS = (64, 1024)  # its sizes are compiled one by one
 _LIMITS: dict[str, Any] = {
     "kappa": 0.3125,
     "rate_limit": 5.0,
@@ -108,7 +110,8 @@ def _vector(n: int, env_id: str = _ID, **options: Any) -> tuple[Callable[[], obj
     return call, n * steps
 
 
-def _l2f_single() -> Callable[[], object]:
+def _l2f_single(whole: bool) -> Callable[[], object]:
+    """Bare calls, or all that a loop needs: the observation in Python, and the state to go on from."""
     import l2f  # type: ignore[import-not-found]
 
     device = l2f.Device()
@@ -125,6 +128,9 @@ def _l2f_single() -> Callable[[], object]:
         for _ in range(_STEPS):
             l2f.step(device, env, parameters, state, action, following, rng)
             l2f.observe(device, env, parameters, following, observation, rng)
+            if whole:
+                state.assign(following)
+                list(observation.observation)
 
     return call
 
@@ -166,9 +172,11 @@ def measure(seconds: float) -> dict[str, dict[str, float]]:
         candidates[f"{_ROWS} with {name}"] = _vector(_ROWS, **{"env_id": _ID, "substeps": 5, **options})
         physics[f"{_ROWS} with {name}"] = 5, _DT
     if importlib.util.find_spec("l2f"):
-        candidates["l2f: one, step + observe"] = _l2f_single(), _STEPS
-        candidates["l2f: vector of 1024"] = _l2f_vector(1024)
-        physics["l2f: one, step + observe"] = physics["l2f: vector of 1024"] = 1, 0.01
+        for name, whole in _L2F_SINGLE.items():
+            candidates[name], physics[name] = (_l2f_single(whole), _STEPS), (1, 0.01)
+        for n in _L2F_ROWS:
+            candidates[f"l2f: vector of {n}"] = _l2f_vector(n)
+            physics[f"l2f: vector of {n}"] = 1, 0.01
     found = rates(candidates, seconds)
     return {
         name: {
@@ -188,10 +196,10 @@ def ratios(found: dict[str, dict[str, float]]) -> dict[str, float]:
         out[f"{_ROWS} with {name} / with nothing"] = (
             rate[f"{_ROWS} with {name}"] / rate[f"{_ROWS} with nothing"]
         )
-    for name in ("l2f: one, step + observe", "l2f: vector of 1024"):
-        if name in rate:
-            ours = "one env, 5 substeps" if "one" in name else "vector of 1024, 5 substeps"
-            out[f"{ours} / {name}"] = rate[ours] / rate[name]
+    pairs = {f"l2f: vector of {n}": f"vector of {n}, 5 substeps" for n in _L2F_ROWS}
+    for theirs, ours in {**dict.fromkeys(_L2F_SINGLE, "one env, 5 substeps"), **pairs}.items():
+        if theirs in rate:
+            out[f"{ours} / {theirs}"] = rate[ours] / rate[theirs]
     return out
 
 

@@ -266,6 +266,7 @@ def _over_all(
             "condition": condition,
             "policy": name,
             "kind": of[envs[0]].kind,
+            "trace": of[envs[0]].trace,
             "environments": len(envs),
             "seeds": min(len(of[env].evaluations) for env in envs),
             "score": float(np.mean([of[env].values("score").mean() for env in envs])),
