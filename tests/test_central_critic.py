@@ -219,6 +219,11 @@ def test_a_network_that_sees_more_vehicles_names_the_argument():
         make_policy("dagger-formation", make_env(FORMATION, sensed=2))
 
 
+def test_a_network_is_refused_where_vehicles_send_plans_and_told_what_to_choose():
+    with pytest.raises(ValueError, match=r"gives 4 numbers.*has 34: choose comm='state'"):
+        make_policy("dagger-formation", make_env(FORMATION, comm="plan"))
+
+
 def test_a_critic_without_end_is_refused():
     with pytest.raises(ValueError, match=r"a layer of hyperparameter critic_arch"):
         train(FORMATION, "mappo", hyper={"critic_arch": [10**9]})

@@ -361,6 +361,8 @@ def test_a_team_that_cannot_be_reached_warns_and_flies(module, kwargs):
     with pytest.warns(UserWarning, match="no spanning tree") as said:
         env = module.parallel_env(**kwargs)
     assert len(said) == 1
+    nobody = kwargs in ({"measuring": ()}, {"detection": 0.0})
+    assert ("nobody measures: let somebody" in str(said[0].message)) == nobody
     assert not env.task.spanning_tree
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -148,8 +148,10 @@ class NetworkPolicy:
             raise ValueError(f"a network needs a Task or a TeamTask, got {shown(task)}")
         size = task.action_size if isinstance(task, TeamTask) else 4
         if network.outputs != size:
+            plans = isinstance(task, TeamTask) and task.layout.plan
+            remedy = ": choose comm='state', networks send no plans" if plans else ""
             raise ValueError(
-                f"the network gives {network.outputs} numbers, an action of this task has {size}"
+                f"the network gives {network.outputs} numbers, an action of this task has {size}{remedy}"
             )
         if network.commands == "hover" and size == 6:
             raise ValueError("actions of this task are estimates: a network needs commands='action'")

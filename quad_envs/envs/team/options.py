@@ -219,10 +219,11 @@ class TeamOptions(VehicleOptions):
             )
         spanned = self._spans(graphs)
         if not spanned:
+            nobody = "" if self.informed() else "; nobody measures: let somebody (measuring=, detection=)"
             warnings.warn(
                 f"the union of the graphs {shown(self.graph)} has no spanning tree from "
                 f"{'the leader' if self.has_leader else 'the vehicles that measure'} to everybody: "
-                "who is not reached cannot follow",
+                f"who is not reached cannot follow{nobody}",
                 stacklevel=2,
             )
         known = self.task_fields()
