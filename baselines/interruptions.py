@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM that are not lost.
+"""Ctrl-C, SIGTERM and SIGHUP that are not lost.
 
 Python raises KeyboardInterrupt wherever it happens to be. In a finaliser, or in a callback from compiled code
 (llvmlite while a kernel compiles, torch), nobody can catch it: Python writes it off, and the program goes on
@@ -7,7 +7,10 @@ as if nobody had pressed anything. Here a signal is also remembered, and loops a
 
 from __future__ import annotations
 
+import errno
+import os
 import signal
+import stat
 import sys
 import threading
 from collections.abc import Iterator
@@ -15,11 +18,15 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-INTERRUPTED, TERMINATED = 130, 143  # exit codes, as the shell names the signals
+HUNG_UP, INTERRUPTED, TERMINATED = 129, 130, 143  # exit codes, as the shell names the signals
 
 
 class Terminated(KeyboardInterrupt):
     """SIGTERM, which ends a program as Ctrl-C does: what was reached is saved."""
+
+
+class HungUp(KeyboardInterrupt):
+    """SIGHUP, from a terminal that is closed: nobody reads what is said from then on."""
 
 
 class _Memory:
@@ -33,26 +40,29 @@ class _Memory:
 
 _memory = _Memory()
 _KINDS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated}
+_ENDING = [signal.SIGTERM]  # signals that end a program, beside Ctrl-C
+if hasattr(signal, "SIGHUP"):  # which Windows does not have
+    _KINDS[signal.SIGHUP] = HungUp
+    _ENDING.append(signal.SIGHUP)
 
 
 def exit_code(interruption: KeyboardInterrupt) -> int:
     """The exit code of a program that was interrupted."""
+    if isinstance(interruption, HungUp):
+        return HUNG_UP
     return TERMINATED if isinstance(interruption, Terminated) else INTERRUPTED
 
 
 @contextmanager
 def remembered(*, terminate: bool = False) -> Iterator[None]:
-    """Remember Ctrl-C, and SIGTERM too if asked to; blocks may be inside each other.
+    """Remember Ctrl-C, and SIGTERM and SIGHUP too if asked to; blocks may be inside each other.
 
     Handlers that are not Python's own are left alone, as a signal that is ignored; so are other threads,
     which hear no signals.
     """
-    usual: dict[signal.Signals, Any] = {
-        signal.SIGINT: signal.default_int_handler,
-        signal.SIGTERM: signal.SIG_DFL,
-    }
-    if not terminate:
-        del usual[signal.SIGTERM]
+    usual: dict[signal.Signals, Any] = {signal.SIGINT: signal.default_int_handler}
+    if terminate:
+        usual |= dict.fromkeys(_ENDING, signal.SIG_DFL)
     ours = [number for number, handler in usual.items() if signal.getsignal(number) is handler]
     if threading.current_thread() is not threading.main_thread() or not ours:
         yield
@@ -100,11 +110,29 @@ def held() -> Iterator[None]:
 
 def _on_signal(number: int, frame: FrameType | None) -> None:
     kind = _KINDS[signal.Signals(number)]
+    if kind is HungUp:
+        _leave_terminal()
     if _memory.held:
         _memory.late = kind
         return
     _memory.pending = kind
     raise kind
+
+
+def _leave_terminal() -> None:
+    """Say nothing to a terminal that is gone: writing to it would be another error."""
+    import termios
+
+    for number in (1, 2):
+        try:
+            if stat.S_ISCHR(os.fstat(number).st_mode):
+                termios.tcgetattr(number)
+        except (OSError, termios.error) as error:
+            if error.args[0] != errno.EIO:
+                continue  # no terminal, as /dev/null
+            null = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null, number)
+            os.close(null)
 
 
 def _quiet(hook: Any) -> Any:

@@ -1,12 +1,17 @@
-"""Ctrl-C and SIGTERM end a command wherever they arrive: what was reached is saved, nobody stays behind."""
+"""Ctrl-C, SIGTERM and SIGHUP end a command wherever they arrive: nothing is lost, nobody stays behind."""
 
 from __future__ import annotations
 
 import ctypes
+import fcntl
 import os
 import signal
+import subprocess
+import sys
+import termios
 import threading
 import time
+from contextlib import suppress
 
 import pytest
 from processes import start_command
@@ -16,7 +21,7 @@ from stub_training import (
 )
 
 from baselines.__main__ import COMMANDS, main
-from baselines.interruptions import Terminated, exit_code, held, raise_lost, remembered
+from baselines.interruptions import HungUp, Terminated, exit_code, held, raise_lost, remembered
 from baselines.policies.checkpoints import load_checkpoint
 from baselines.training.runs import train
 
@@ -26,9 +31,10 @@ HELIX = "quad/HelixTracking-v0"
 @pytest.fixture(autouse=True)
 def hears_signals():
     """Whatever these tests were started from: a shell lets what runs in its background ignore Ctrl-C."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
@@ -174,8 +180,8 @@ def test_a_policy_that_was_judged_is_saved_before_the_run_ends(tmp_path, monkeyp
     load_checkpoint(tmp_path / "run" / "last")
 
 
-def test_commands_end_with_one_line_at_both_signals(capsys, monkeypatch):
-    for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 143)):
+def test_commands_end_with_one_line_at_each_signal(capsys, monkeypatch):
+    for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)):
         monkeypatch.setitem(
             COMMANDS, "list", COMMANDS["list"]._replace(run=lambda options, number=number: press(number))
         )
@@ -186,6 +192,7 @@ def test_commands_end_with_one_line_at_both_signals(capsys, monkeypatch):
 def test_the_codes_are_those_of_the_shell():
     assert exit_code(KeyboardInterrupt()) == 128 + signal.SIGINT
     assert exit_code(Terminated()) == 128 + signal.SIGTERM
+    assert exit_code(HungUp()) == 128 + signal.SIGHUP
 
 
 def children(process):
@@ -202,13 +209,26 @@ def alive(number):
         return False
 
 
+def nobody_is_left(workers):
+    """Whether these processes end soon."""
+    assert workers
+    for _ in range(100):
+        if not any(map(alive, workers)):
+            return True
+        time.sleep(0.1)
+    return False
+
+
+LONG = 'envs = ["quad/HelixTracking-v0"]\npolicies = ["random", "hover", "lqr"]\nepisodes = 2000\n'
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+)
 def test_no_process_stays_behind_a_sweep_that_was_ended(tmp_path, number, code):
     suite, out = tmp_path / "long.toml", tmp_path / "run"
-    suite.write_text(
-        'envs = ["quad/HelixTracking-v0"]\npolicies = ["random", "hover", "lqr"]\nepisodes = 2000\n'
-    )
+    suite.write_text(LONG)
     with start_command("benchmark", suite, "--out", out, "--jobs", "2") as process:
         while not list(out.glob("cells/*.json")) and process.poll() is None:
             time.sleep(0.05)
@@ -216,9 +236,34 @@ def test_no_process_stays_behind_a_sweep_that_was_ended(tmp_path, number, code):
         process.send_signal(number)
         printed, said = process.communicate(timeout=60)
     assert process.returncode == code and printed == "" and "Resume with" in said
-    assert workers
-    for _ in range(100):
-        if not any(map(alive, workers)):
-            break
-        time.sleep(0.1)
-    assert not any(map(alive, workers))
+    assert nobody_is_left(workers)
+
+
+@pytest.mark.slow
+def test_a_sweep_ends_with_its_terminal(tmp_path):
+    """The terminal is closed: what would be said to it is another error, and nobody is to stay behind."""
+    suite, out = tmp_path / "long.toml", tmp_path / "run"
+    suite.write_text(LONG)
+    terminal, end = os.openpty()
+
+    def sit_at_it():
+        os.setsid()
+        fcntl.ioctl(end, termios.TIOCSCTTY, 0)
+
+    process = subprocess.Popen(
+        [sys.executable, "-m", "baselines", "benchmark", str(suite), "--out", str(out), "--jobs", "2"],
+        stdin=end,
+        stdout=end,
+        stderr=end,
+        preexec_fn=sit_at_it,
+    )
+    os.close(end)
+    os.set_blocking(terminal, False)
+    while not list(out.glob("cells/*.json")) and process.poll() is None:
+        time.sleep(0.05)
+        with suppress(BlockingIOError):
+            os.read(terminal, 100_000)
+    workers = children(process)
+    os.close(terminal)
+    assert process.wait(timeout=60) == 129
+    assert nobody_is_left(workers)

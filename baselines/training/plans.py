@@ -121,6 +121,9 @@ def read_start(folder: RunFolder) -> Start:
     """
     network, said, curve = folder.read()
     try:
+        point = read_point(said)
+        if not curve or curve[-1].updates < point.updates:  # a session that ended between these two files
+            curve.append(point)
         return Start(
             network,
             float(said["cpu_seconds"]),

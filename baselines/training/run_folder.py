@@ -65,10 +65,12 @@ class RunFolder:
                 f"{found['seed']}: go on with it (--resume), discard it (--fresh), or choose another folder"
             )
         else:
-            for name in _FILES:
+            # First what --resume would go on from, and config.json in the end: it says whose the others are.
+            for name in (f"{self.last.name}/{WEIGHTS}", *_FILES[:-1]):
                 (self.path / name).unlink(missing_ok=True)
-            for name in ("last", "tensorboard"):
+            for name in (self.last.name, "tensorboard"):
                 shutil.rmtree(self.path / name, ignore_errors=True)
+            (self.path / _FILES[-1]).unlink(missing_ok=True)
         self.write_config([])
 
     def has_policy(self) -> bool:
@@ -106,6 +108,20 @@ class RunFolder:
             )
         network, described = load_checkpoint(self.last)
         return network, described, self.read_curve()
+
+    def mend(self, curve: Sequence[Point]) -> None:
+        """Make best policy and curve what the last policy says: a session may have ended between these files.
+
+        Args:
+            curve: Up to the last policy.
+        """
+        for place in (self.path, self.last):
+            for name in (WEIGHTS, DESCRIPTION):
+                (place / f"{name}.new").unlink(missing_ok=True)
+        network, said = load_checkpoint(self.last)
+        if said["best"]["updates"] == said["updates"]:
+            save_checkpoint(self.path, network, said)
+        self.write_curve(curve)
 
     def note_session(self) -> None:
         """Say in config.json that the run goes on, by which command."""

@@ -83,7 +83,7 @@ def run_training(request: TrainingRequest) -> TrainingResult:
         if request.resume and folder.has_policy():
             start = _resume(folder, plan)
         else:
-            folder.begin(request.fresh)
+            folder.begin(request.fresh or request.resume)  # what has no last policy was being discarded
             start = Start(plan.network)
         run = _Run(folder, plan, held_out, start, request.watcher)
         run.go()
@@ -95,6 +95,7 @@ def run_training(request: TrainingRequest) -> TrainingResult:
 def _resume(folder: RunFolder, plan: Plan) -> Start:
     """Where the run in the folder goes on."""
     start = read_start(folder)
+    folder.mend(start.curve)
     if plan.budget.share(start.seconds, start.steps) >= 1.0:
         raise ResultsError(
             f"{str(folder.path)!r} has used {start.seconds:.1f} CPU-seconds and {start.steps} steps, all of "
@@ -199,9 +200,10 @@ class _Run:
             self.best = point
         about, failure = self._about(point), ""
         try:
+            # First the one from which --resume goes on: what it says makes the others whole, see `_resume`.
+            self.folder.save_last(self.network, about)
             if best:
                 self.folder.save_best(self.network, about)
-            self.folder.save_last(self.network, about)
             self.folder.write_curve(self.curve)
             self._unsaved = None
         except (CheckpointError, ResultsError) as error:

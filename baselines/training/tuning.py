@@ -11,6 +11,7 @@ config.json   task, policy, options, objective, seed, versions, revision, comman
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -44,6 +45,7 @@ _SPREAD = 0.3  # decades, of the first generation
 _VIOLATING = 10.0  # score that a flight loses if all its steps violate: limits come before the score
 _CRASHED = 1e3  # beside any cost
 _LAST = "last.json"
+_LEARNED = ("C", "p_sigma", "pc", "g")  # of CMA-ES, beside its mean and sigma
 _FILES = (DESCRIPTION, "curve.csv", _LAST, "config.json")
 
 
@@ -146,6 +148,26 @@ def _cma(search: Search, mean: Array, sigma: float = _SPREAD, seed: int = 0) -> 
     return CMA(mean=mean, sigma=sigma, bounds=search.bounds, seed=seed)
 
 
+def _state(cma: Any) -> dict[str, Any]:
+    """What beside its mean and sigma a distribution has learned, and its random numbers, as plain values."""
+    _, keys, position, has_gauss, gauss = cma._rng.get_state()
+    return {
+        **{name: getattr(cma, f"_{name}") for name in _LEARNED},
+        "random": [keys.tobytes().hex(), int(position), int(has_gauss), float(gauss)],
+    }
+
+
+def _restore(cma: Any, last: Mapping[str, Any]) -> None:
+    """Give a distribution that state; a search of before has none, and goes on with other candidates."""
+    if "random" not in last:
+        return
+    for name in _LEARNED:
+        value = last[name]
+        setattr(cma, f"_{name}", np.array(value) if isinstance(value, list) else value)
+    keys, *rest = last["random"]
+    cma._rng.set_state(("MT19937", np.frombuffer(bytes.fromhex(keys), dtype=np.uint32), *rest))
+
+
 def _require_a_generation(request: TuningRequest, candidates: int) -> None:
     least, asked = FLIGHTS * candidates, request.episodes
     if asked is not None and asked < least:
@@ -207,16 +229,19 @@ class _Run:
         self.best_z, self.best_loss, mean = np.zeros(search.size), math.inf, np.zeros(search.size)
         seconds, self.generation, self.episodes = 0.0, 0, 0
         sigma = _SPREAD
-        if request.resume:
-            last = self._read()
+        last = self._read() if request.resume else None
+        if last is not None:
             mean, self.best_z = np.array(last["mean"]), np.array(last["best"])
             self.best_loss, sigma = last["loss"], last["sigma"]
             seconds, self.generation, self.episodes = last["seconds"], last["generation"], last["episodes"]
         self.clock = TrainingClock(seconds)
-        seed = 1000 * request.seed + self.generation
-        self.cma = _cma(search, mean, sigma, seed)
-        if not request.resume:
+        self.cma = _cma(search, mean, sigma, 1000 * request.seed + self.generation)
+        if last is None:
             self._begin()
+        else:
+            _restore(self.cma, last)
+            self._write_best()  # whoever died between these files
+            self._write_curve()
         self.env = HeldOutFlights(request.env_id, dict(request.env_kwargs or {}), FLIGHTS).env
 
     def best(self) -> Point:
@@ -286,19 +311,25 @@ class _Run:
             self.curve.append(point)
             if best:
                 self.best_z, self.best_loss = z, loss
-                tuned = TunedPolicy(
-                    self.request.policy,
-                    self.search.options(z),
-                    self.held_out.task.env_id,
-                    vehicle_of(self.held_out.task),
-                )
-                write_tuned(self.path, tuned, {**self.about, **point._asdict(), **tuned._asdict()})
-            write_csv(self.path / "curve.csv", [each._asdict() for each in self.curve])
+            # First the file that has it all, from which the others are made anew if this ends between them.
             write_json(self.path / _LAST, self._last())
+            if best:
+                self._write_best()
+            self._write_curve()
         if self.request.watcher is not None:
             self.request.watcher.judged(point, best)
 
+    def _write_best(self) -> None:
+        task = self.held_out.task
+        options = self.search.options(self.best_z)
+        tuned = TunedPolicy(self.request.policy, options, task.env_id, vehicle_of(task))
+        write_tuned(self.path, tuned, {**self.about, **self.best()._asdict(), **tuned._asdict()})
+
+    def _write_curve(self) -> None:
+        write_csv(self.path / "curve.csv", [each._asdict() for each in self.curve])
+
     def _last(self) -> dict[str, Any]:
+        """All of the search, so that it goes on as if nothing had been."""
         found: dict[str, Any] = plain_json(
             {
                 "mean": self.cma.mean,
@@ -308,6 +339,8 @@ class _Run:
                 "seconds": self.clock.seconds,
                 "generation": self.generation,
                 "episodes": self.episodes,
+                "curve": [point._asdict() for point in self.curve],
+                **_state(self.cma),
             }
         )
         return found
@@ -344,12 +377,10 @@ class _Run:
             (self.path / name).unlink(missing_ok=True)
         write_json(self.path / "config.json", {**self.about, **provenance()})
 
-    def _read(self) -> dict[str, Any]:
-        """Where the search in the folder goes on."""
-        import csv
-
+    def _read(self) -> dict[str, Any] | None:
+        """Where the search in the folder goes on; None if it ended before its first candidate was judged."""
         found = self._config()
-        if found is None or not (self.path / _LAST).exists():
+        if found is None:
             raise ResultsError(
                 f"{str(self.path)!r} holds no tuning that could be resumed; leave --resume out"
             )
@@ -359,7 +390,14 @@ class _Run:
                     f"{str(self.path)!r} holds another tuning: its {name} is {json.dumps(found.get(name))}, "
                     f"asked for is {json.dumps(value)}; give the same, or choose another folder"
                 )
-        with open(self.path / "curve.csv", newline="") as file:
-            self.curve = [read_point(row) for row in csv.DictReader(file)]
+        if not (self.path / _LAST).exists():
+            return None
         last: dict[str, Any] = read_json(self.path / _LAST)
+        rows = last.get("curve")
+        if rows is None:  # a search of before
+            with open(self.path / "curve.csv", newline="") as file:
+                rows = list(csv.DictReader(file))
+        self.curve = [
+            read_point({name: "nan" if x is None else x for name, x in row.items()}) for row in rows
+        ]
         return last
