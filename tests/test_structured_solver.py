@@ -2,17 +2,16 @@
 
 import pickle
 
-import daqp
 import numpy as np
 import pytest
 from ocp_problems import LIMITS, MODELS, hover_qp, random_qp, tilt_rows, velocity_rows
 
+from benchmarks.trust.problems import solve_daqp
 from controllers.qp import Status, StructuredSolver, residuals
 from controllers.qp.ocp import (
     StateRows,
     concatenate_rows,
     condense,
-    first_move_bounds,
     output_rows,
     rate_weight,
 )
@@ -23,28 +22,6 @@ from controllers.qp.workspace import make_workspace
 SOLVER = StructuredSolver()
 FAR = np.r_[3.0, 3.0, 3.0, np.zeros(9)]
 FREE = {"lower": np.full(4, -np.inf), "upper": np.full(4, np.inf), "rate_step": np.inf}
-
-
-def condensed_rows(qp):
-    """Rows a'u of rate and state limits with both bounds, for dense solvers."""
-    H, g, S, f = condense(qp)
-    nv = len(g)
-    first_lower, first_upper = first_move_bounds(qp)
-    steps = np.full(nv - 4, qp.rate_step)
-    rows = qp.rows
-    normals = rows.normals[rows.normal]
-    offset = np.einsum("kn,kn->k", normals, f[rows.stage])
-    matrix = np.vstack([np.eye(nv) - np.eye(nv, k=-4), np.einsum("kn,knv->kv", normals, S[rows.stage])])
-    lower = np.r_[np.tile(qp.lower, nv // 4), first_lower, -steps, rows.lower - offset]
-    upper = np.r_[np.tile(qp.upper, nv // 4), first_upper, steps, rows.upper - offset]
-    return H, g, matrix, np.clip(lower, -1e30, 1e30), np.clip(upper, -1e30, 1e30)
-
-
-def solve_daqp(qp):
-    H, g, matrix, lower, upper = condensed_rows(qp)
-    sense = np.zeros(len(lower), dtype=np.int32)
-    u, _, flag, _ = daqp.solve(H, g, matrix, upper, lower, sense, primal_tol=1e-10, dual_tol=1e-10)
-    return u[: len(g)].reshape(-1, 4), flag
 
 
 def agree_with_conditions(qp, solution):

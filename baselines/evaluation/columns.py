@@ -300,11 +300,19 @@ def renamed(stored: Mapping[str, Any]) -> dict[str, Any]:
     return {_RENAMED.get(name, name): value for name, value in stored.items()}
 
 
+_WORDS = ("agent", "crash_cause")  # fields of a Record; the others are numbers, or numbers by name
+
+
 def read_record(stored: Mapping[str, Any]) -> Record:
     """A record as JSON stored it, nan as null, also from results of before `quadratic_cost`.
 
     Raises:
-        TypeError: If a column is missing or not known.
+        TypeError: If a column is missing or not known, or is no number where it is to be one.
     """
     found = {name: math.nan if value is None else value for name, value in renamed(stored).items()}
-    return Record(**{**_ADDED, **found})
+    record = Record(**{**_ADDED, **found})
+    for name, value in zip(Record._fields, record, strict=True):
+        values = value.values() if name == "worst_violation" and isinstance(value, dict) else (value,)
+        if not all(isinstance(one, str if name in _WORDS else int | float) for one in values):
+            raise TypeError(f"{name} is {value!r}")
+    return record

@@ -217,6 +217,40 @@ def _update_by_fix(
 
 
 @kernel
+def _is_finite(values: Array) -> bool:
+    bad = 0
+    for value in values:
+        bad |= 0 if abs(value) < math.inf else 1
+    return bad == 0
+
+
+@kernel
+def _enter(
+    z: Array,
+    place: Array,
+    age: Array,
+    valid: NDArray[np.bool_],
+    sigma: Array,
+    rows: Int,
+    limits: Array | None,
+    data: FilterData,
+    prior: Array,
+    x: Array,
+    covariance: Array,
+    report: Array,
+    rest: Array,
+) -> None:
+    """Let the measurements that are held enter, as a trilaterated position or as they are."""
+    if limits is not None:
+        nis, done = _update_by_fix(z, place, age, valid, sigma, limits, data, prior, x, covariance, rest)
+        if done:
+            report[0], report[1], report[3] = nis, 3.0, 1.0
+            return
+    nis, used, _, _ = ekf_update_kernel(x, covariance, z, place, age, valid, sigma, rows, prior, True, rest)
+    report[0], report[1] = nis if used > 0 else math.nan, float(used)
+
+
+@kernel
 def filter_row(
     plant: Array,
     disturbance: Array,
@@ -273,13 +307,11 @@ def filter_row(
         elif _start_at_lines(z, place, age, valid, sigma, x, covariance, rest):
             memory[STAGE] = 2.0
     report[2], report[3] = float(held), 0.0
-    if limits is not None:
-        nis, done = _update_by_fix(z, place, age, valid, sigma, limits, data, prior, x, covariance, rest)
-        if done:
-            report[0], report[1], report[3] = nis, 3.0, 1.0
-            return
-    nis, used, _, _ = ekf_update_kernel(x, covariance, z, place, age, valid, sigma, rows, prior, True, rest)
-    report[0], report[1] = nis if used > 0 else math.nan, float(used)
+    _enter(z, place, age, valid, sigma, rows, limits, data, prior, x, covariance, report, rest)
+    if not (_is_finite(x) and _is_finite(memory[7:43])):  # after numbers that no sensor gives
+        _begin(slot, prior, x, covariance)
+        memory[STAGE] = 1.0
+        report[0], report[1], report[3] = math.nan, 0.0, 0.0
 
 
 @kernel

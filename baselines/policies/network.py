@@ -22,7 +22,7 @@ from quad_envs.tasks import BaseTask, Task, TeamTask
 
 from .network_kernels import forward_rows
 from .protocol import Actions, PolicyState
-from .rows import as_rows, as_starts, not_finite, require_finite, state_of
+from .rows import as_rows, as_starts, not_finite, require_finite, state_of, too_large
 
 Floats = NDArray[np.float32]
 Squash = Literal["tanh", "clip"]
@@ -184,7 +184,8 @@ class NetworkPolicy:
         action of a row differs by up to 1e-6 with the number of rows beside it.
 
         Raises:
-            ValueError: If a shape is wrong or an observation is not finite; it names the part.
+            ValueError: If a shape is wrong, or an observation is not finite or so large that the answer is no
+                number; it names the part.
         """
         obs, one = as_rows(observation, self._size)
         n = len(obs)
@@ -205,6 +206,8 @@ class NetworkPolicy:
         bad = _forward(obs, self._columns, self._scaling, *layers, self._gains, work, out)
         if bad >= 0:
             raise not_finite(obs, bad, self.task.layout.slices)
+        if bad < -1:
+            raise too_large(obs, -2 - bad, self.task.layout.slices)
         return out
 
     def _many(self, obs: Floats) -> Actions:
@@ -214,13 +217,16 @@ class NetworkPolicy:
         if len(self._scaling):
             mean, scale, clip = self._scaling
             x = np.clip((x - mean) / scale, -clip, clip).astype(np.float32)
-        for k, (W, b) in enumerate(self._layers):
-            x = x @ W
-            x += b
-            if k + 1 < len(self._layers) and self.network.activation == "relu":
-                np.maximum(x, 0.0, out=x)
-            elif k + 1 < len(self._layers) or self.network.squash == "tanh":
-                np.tanh(x, out=x)
+        with np.errstate(over="ignore", invalid="ignore"):  # what is too large is said below
+            for k, (W, b) in enumerate(self._layers):
+                x = x @ W
+                x += b
+                if k + 1 < len(self._layers) and self.network.activation == "relu":
+                    np.maximum(x, 0.0, out=x)
+                elif k + 1 < len(self._layers) or self.network.squash == "tanh":
+                    np.tanh(x, out=x)
+        if np.isnan(x).any():
+            raise too_large(obs, int(np.argmax(np.isnan(x).any(axis=1))), self.task.layout.slices)
         np.clip(x, -1.0, 1.0, out=x)
         hover = self.network.commands == "hover"
         return hover_actions(x, self.task, self.network.command_range) if hover else x

@@ -60,7 +60,8 @@ def forward_rows(
         out: Result, (n, sizes[-1]).
 
     Returns:
-        -1, or the flat index of the first entry of the observations that is not finite, seen or not.
+        -1, or the flat index of the first entry of the observations that is not finite, seen or not; or
+        -2 - r where row r is finite, but so large that the network's answer is no number.
     """
     layers = sizes.size - 1
     relu, tanh_last = kinds[0], kinds[1]
@@ -86,6 +87,8 @@ def forward_rows(
                     y[j] = math.tanh(y[j])
             at += (n + 1) * m
         for j in range(sizes[layers]):
+            if work[layers % 2, j] != work[layers % 2, j]:
+                return -2 - r
             answer = min(max(work[layers % 2, j], np.float32(-1.0)), np.float32(1.0))
             if j < 4:
                 answer = min(answer * gains[0 if answer < 0.0 else 1, j], np.float32(1.0))

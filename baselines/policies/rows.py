@@ -87,13 +87,29 @@ def first_not_finite(row: Actions) -> int:
 def not_finite(obs: NDArray[Any], index: int, slices: Mapping[str, slice]) -> ValueError:
     """The error for an observation with NaN or infinity at a flat index; slices name its parts."""
     row, column = divmod(index, obs.shape[1])
-    parts = {name: part for name, part in slices.items() if name != "own"}
-    name = next(name for name, part in parts.items() if part.start <= column < part.stop)
-    where = f"entry {column - parts[name].start} of {name!r}"
+    name, start = _part(column, slices)
+    where = f"entry {column - start} of {name!r}"
     return ValueError(
         f"observation {row} is not finite: {where} (index {column}) is {obs[row, column]}; "
         "check the sensors or the wrapper that made it"
     )
+
+
+def too_large(obs: NDArray[Any], row: int, slices: Mapping[str, slice]) -> ValueError:
+    """The error for a finite observation that no action follows from; slices name its parts."""
+    column = int(np.argmax(np.abs(obs[row])))
+    name, start = _part(column, slices)
+    return ValueError(
+        f"no action follows from observation {row}: entry {column - start} of {name!r} (index {column}) is "
+        f"{obs[row, column]:g}, beyond what float32 can hold; check the sensors or the wrapper that made it"
+    )
+
+
+def _part(column: int, slices: Mapping[str, slice]) -> tuple[str, int]:
+    """Name and first column of the part of an observation in which a column is."""
+    parts = {name: part for name, part in slices.items() if name != "own"}
+    name = next(name for name, part in parts.items() if part.start <= column < part.stop)
+    return name, int(parts[name].start)
 
 
 def require_finite(obs: NDArray[Any], slices: Mapping[str, slice]) -> None:

@@ -43,6 +43,8 @@ def read_flight(
         BadFlightError: If it is missing, damaged, or not the file of a flight.
     """
     try:
+        if path.exists() and not path.is_file():  # a pipe would never end
+            raise ValueError("it is not a regular file")
         # Opened here, because np.load leaves a damaged file open.
         with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
             arrays = {key: file[key] for key in file.files}

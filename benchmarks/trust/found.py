@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import signal
+import traceback
 from collections.abc import Callable, Iterator
+from types import FrameType
 from typing import NamedTuple
+
+_SECONDS = 60.0  # after which a try hangs
 
 
 class Found(NamedTuple):
@@ -24,10 +29,26 @@ class Figure(NamedTuple):
     worst: str = ""  # what the watched number is
 
 
-def tried(what: str, run: Callable[[], str]) -> Found:
-    """One try; `run` says what is wrong, or nothing. An exception that it lets through is wrong, too."""
+def tried(what: str, run: Callable[[], str | None]) -> Found:
+    """One try; `run` says what is wrong, or nothing. What it raises is wrong, too, and so is to hang."""
+    before = signal.signal(signal.SIGALRM, _hangs)
+    signal.setitimer(signal.ITIMER_REAL, _SECONDS)
     try:
-        said = run()
-    except Exception as error:
+        said = run() or ""
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # SystemExit, too
         said = f"{type(error).__name__}: {error}"
-    return Found(1, (f"{what}: {' '.join(said.split())[:300]}",) if said else ())
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    return Found(1, (f"{what}: {' '.join(said.split())[:400]}",) if said else ())
+
+
+class Hangs(BaseException):
+    """A try takes far longer than any should; nobody is to catch this."""
+
+
+def _hangs(number: int, frame: FrameType | None) -> None:
+    where = traceback.extract_stack(frame)[-1]
+    raise Hangs(f"for {_SECONDS:.0f} s, in {where.name} of {where.filename}")

@@ -1,0 +1,107 @@
+"""What the figures of trust found, and a little of each of them."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from baselines import ResultsError, make_policy, run_benchmark
+from baselines.policies.network import NetworkPolicy
+from baselines.report import render_report
+from baselines.sweeps.folder import read_run
+from benchmarks.trust import kills, malformed, observations, problems, repeat, soak
+from benchmarks.trust.__main__ import FIGURES, Outcome, table, try_out
+from quad_envs import cooperative_estimation_v0
+
+HELIX = "quad/HelixTracking-v0"
+
+
+@pytest.mark.parametrize("rows", [1, 4, 9])  # up to four are decided by a kernel
+def test_an_observation_beyond_what_a_network_holds_is_refused_by_its_row(rows):
+    env = gym.make("quad/CorridorTracking-v0")
+    network = replace(make_policy("apg-corridor", env).network, activation="relu")  # inf, then inf - inf
+    observation = np.tile(env.reset(seed=0)[0], (rows, 1))
+    observation[-1] = 3e38
+    with pytest.raises(ValueError, match=f"no action follows from observation {rows - 1}: entry 0 of 'V_B'"):
+        NetworkPolicy(network, env.unwrapped.task, "large").predict(observation)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", ["ekf", "trilateration", "cooperative-mpc"])
+def test_a_filter_that_was_told_nonsense_begins_anew(name):
+    env = cooperative_estimation_v0.parallel_env()
+    policy = make_policy(name, env)
+    usual = np.array(list(env.reset(seed=0)[0].values()))
+    starts = np.ones(len(usual), dtype=np.bool_)
+    _, state = policy.predict(usual, None, starts)
+    wild = np.full_like(usual, np.finfo(np.float32).max)
+    wild[:, ::2] *= -1.0
+    action, state = policy.predict(wild, state, ~starts)
+    assert np.isfinite(action).all() and np.abs(action).max() <= 1.0
+    action, state = policy.predict(usual, state, ~starts)
+    assert np.isfinite(action).all() and np.isfinite(state.memory).all()
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A results folder."""
+    suite = {"envs": [{"id": HELIX, "kwargs": {"time_limit": 0.5}}], "policies": ["hover"], "episodes": 1}
+    run_benchmark(suite, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def test_a_pipe_in_place_of_a_flight_is_not_waited_for(folder):
+    (flight,) = (folder / "episodes").iterdir()
+    flight.unlink()
+    os.mkfifo(flight)
+    assert "is damaged (it is not a regular file)" in render_report(read_run(folder))
+
+
+@pytest.mark.parametrize(("name", "value"), [("score", "x"), ("effort", []), ("agent", 3), ("steps", {})])
+def test_a_cell_with_a_word_for_a_number_is_refused_by_name(folder, name, value):
+    (cell,) = (folder / "cells").iterdir()
+    data = json.loads(cell.read_text())
+    data["found"]["records"][0][name] = value
+    cell.write_text(json.dumps(data))
+    with pytest.raises(ResultsError, match="delete it to fly this unit again") as said:
+        read_run(folder)
+    assert cell.name in str(said.value) and name in str(said.value)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    ("tries", "number"),
+    [
+        (soak.soak, 6),
+        (problems.problems, 60),
+        (observations.observations, 50),
+        (malformed.malformed, 40),
+        (repeat.repeat, 11),
+    ],
+)
+def test_a_little_of_each_figure_fails_nowhere(tries, number):
+    found = list(itertools.islice(tries(3), number))
+    assert [line for one in found for line in one.wrong] == []
+    assert sum(one.tried for one in found) >= number
+
+
+def test_the_table_says_what_was_tried_and_what_failed(monkeypatch):
+    one = try_out("problems", 10, 60.0, 0)
+    assert one.tried == 10 and one.failed == 0 and 0.0 <= one.worst < 1e-8
+    printed = table([one, Outcome("kills", 3, 1, 0.0, 2.0, ("benchmark: differs",))])
+    assert "100000 problems" in printed and printed.splitlines()[-1].split()[-4:] == ["3", "1", "-", "2"]
+    assert set(FIGURES) == {
+        *("soak", "problems", "observations", "inputs", "kills", "malformed", "repeat"),
+    }
+
+
+def test_a_command_that_dies_is_counted_as_dead_and_goes_on(tmp_path):
+    job = kills.JOBS[1]  # evaluate, the quickest
+    found = list(itertools.islice(kills.kills(2, [job]), 3))
+    assert [one.wrong for one in found] == [()] * 3
