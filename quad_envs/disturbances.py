@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from .authority import hover_authority
 from .compilation.decorators import inline_kernel, kernel
-from .kinds import as_tuple, is_number, make_kind, refuse_class, without_booleans
+from .kinds import as_tuple, is_number, make_kind, refuse_class, require_kinds, without_booleans
 from .limits import Limits
 from .names import shown, unknown_name
 from .normals import draw, drawn_size, key_of
@@ -65,6 +65,7 @@ class TorquePulse:
     random: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
+        require_kinds(self)
         if self.clock not in ("absolute", "relative"):
             raise ValueError(f"clock must be 'absolute' or 'relative', got {shown(self.clock)}")
         if not self.start < self.stop:
@@ -180,6 +181,7 @@ class Gusts:
     random: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
+        require_kinds(self)
         for name, unit in (("force", "N"), ("torque", "N m")):
             value = getattr(self, name)
             size = np.asarray(0.0 if value is None else value, dtype=np.float64)

@@ -19,8 +19,9 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .checks import Bound, array_bytes, require_memory, require_number, require_whole
 from .formations import FORMATIONS, lattice_cells
-from .kinds import is_number, make_kind, refuse_class
+from .kinds import is_number, make_kind, refuse_class, require_kinds
 from .names import shown, unknown_name
 from .parameters import Array
 
@@ -46,6 +47,8 @@ def adjacency(n: int, edges: Edges) -> Array:
     Raises:
         ValueError: If an edge names a vehicle outside 0 .. n-1 or joins one to itself, or weighs nothing.
     """
+    require_whole("vehicles of a graph", n, 1)
+    require_memory(f"a graph of {n} vehicles", array_bytes((n, n)), "take fewer")
     G = np.eye(n)
     for sender, receiver, *weight in edges:
         if sender not in range(n) or receiver not in range(n) or sender == receiver:
@@ -100,6 +103,7 @@ def make_graph(what: GraphLike, formation: str | None, n: int) -> Array:
     Raises:
         ValueError: If the name is unknown or does not fit the team, or the matrix is not one of weights.
     """
+    require_whole("vehicles of a graph", n, 1)
     if isinstance(what, str):
         return adjacency(n, _named_edges(what, formation, n))
     if is_networkx(what):
@@ -196,7 +200,25 @@ def union_has_tree(Gs: Array, root: int = 0) -> bool:
 
 
 def toward_leader(G: Array, weight: float = 10.0, root: int = 0) -> Array:
-    """G with this weight where the one heard is nearer to the leader, in links, than the one who hears."""
+    """G with this weight where the one heard is nearer to the leader, in links, than the one who hears.
+
+    Args:
+        G: Weights, (n, n).
+        weight: Of such links.
+        root: Number of the leader.
+
+    Raises:
+        ValueError: If one is not allowed.
+    """
+    try:
+        given = np.asarray(G, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        given = np.empty(0)
+    if given.ndim != 2 or given.shape[0] != given.shape[1]:
+        raise ValueError(f"G must be a square matrix of weights, got {shown(G)}")
+    G = given
+    require_whole("root", root, 0, len(G) - 1)
+    require_number("weight", weight, Bound())
     distance = hops(G, root)
     distance[distance < 0] = len(G)
     return np.where((G > 0.0) & (distance[None, :] < distance[:, None]), weight, G)
@@ -251,6 +273,7 @@ class Switching:
     dwell_steps: int = 5
 
     def __post_init__(self) -> None:
+        require_kinds(self)
         object.__setattr__(self, "graphs", _frozen(self.graphs))
         dwell = self.dwell_steps
         if isinstance(dwell, bool) or not isinstance(dwell, int | np.integer) or dwell < 1:
@@ -273,6 +296,7 @@ class Timed:
     times: tuple[float, ...]  # s
 
     def __post_init__(self) -> None:
+        require_kinds(self)
         object.__setattr__(self, "graphs", _frozen(self.graphs))
         object.__setattr__(self, "times", tuple(float(time) for time in self.times))
         if len(self.times) != len(self.graphs):

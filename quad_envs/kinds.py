@@ -156,6 +156,44 @@ def _require_alike(what: str, value: Any, default: Any) -> None:
         raise ValueError(f"{what} must be {wanted}, got {shown(value)}")
 
 
+_KINDS_OF_TYPES: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (  # how an annotation begins
+    ("float", "a number", lambda x: isinstance(x, _NUMBERS)),
+    ("int", "a number", lambda x: isinstance(x, _NUMBERS)),
+    ("None", "None", lambda x: x is None),
+    ("Literal", "a word", lambda x: isinstance(x, str)),
+    ("tuple[float", "several numbers", lambda x: is_sequence(x) and all(isinstance(y, _NUMBERS) for y in x)),
+    ("_Vector", "three numbers", lambda x: is_sequence(x) and all(isinstance(y, _NUMBERS) for y in x)),
+    ("_Triple", "three numbers", lambda x: is_sequence(x) and all(isinstance(y, _NUMBERS) for y in x)),
+    ("Sequence", "a sequence", lambda x: is_sequence(x) or isinstance(x, str)),
+)
+
+
+def require_kinds(value: Any) -> None:
+    """Check that numbers stand in the fields of a frozen dataclass whose annotations say numbers.
+
+    Which numbers they may be is left to their own checks, as is every field of another kind.
+
+    Raises:
+        ValueError: If not; it names the field.
+    """
+    for one in fields(value):
+        parts = [
+            next((kind for kind in _KINDS_OF_TYPES if part.strip().startswith(kind[0])), None)
+            for part in str(one.type).split("|")
+        ]
+        known = [part for part in parts if part is not None]
+        given = getattr(value, one.name)
+        if len(known) < len(parts) or any(fits(given) for _, _, fits in known):
+            continue
+        wanted = " or ".join(dict.fromkeys(words for _, words, _ in known))
+        raise ValueError(f"{one.name} must be {wanted}, got {shown(given)}")
+
+
+def is_sequence(value: Any) -> bool:
+    """Whether it is a list, a tuple or an array of at least one axis."""
+    return isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim > 0)
+
+
 def is_number(value: Any) -> TypeGuard[float]:
     """Whether it is a finite number."""
     if not isinstance(value, _NUMBERS) or isinstance(value, bool):

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .kinds import is_limit, is_number
+from .kinds import is_limit, is_number, require_kinds
 from .names import shown
 from .plant import N_INPUT, N_STATE, POSITION, RATES, VELOCITY, Array
 
@@ -79,6 +79,7 @@ class Limits:
     body_rate: float = math.inf  # rad/s, |p|, |q| and |r|
 
     def __post_init__(self) -> None:
+        require_kinds(self)
         if len(self.kappas) != N_INPUT:
             raise ValueError(f"kappa must be one number or one per rotor, got {shown(self.kappa)}")
         for i, kappa in enumerate(self.kappas):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .checks import Bound, require_number
-from .kinds import is_number
+from .kinds import is_number, require_kinds
 from .limits import Limits as Limits
 from .names import shown
 from .plant import ATTITUDE as ATTITUDE
@@ -198,6 +198,7 @@ class Weights:
     R: tuple[float, ...] = (1.0,) * N_INPUT
 
     def __post_init__(self) -> None:
+        require_kinds(self)
         if len(self.Q) != N_STATE or len(self.R) != N_INPUT:
             raise ValueError(
                 f"weights need {N_STATE} entries in Q and {N_INPUT} in R, got {len(self.Q)} and {len(self.R)}"

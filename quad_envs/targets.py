@@ -59,7 +59,11 @@ def _require_finite(target: object, *names: str) -> None:
     for name in names:
         value = getattr(target, name)
         shape, what = ((3,), "three finite numbers") if name in _VECTORS else ((), "a finite number")
-        if np.shape(value) != shape or not np.isfinite(np.asarray(value, dtype=np.float64)).all():
+        try:
+            numbers = np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            numbers = np.empty(0)
+        if numbers.shape != shape or not np.isfinite(numbers).all():
             raise ValueError(f"{name} of {type(target).__name__} must be {what}, got {shown(value)}")
 
 

@@ -11,12 +11,23 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from baselines import ResultsError, make_policy, run_benchmark
+import quad_envs
+from baselines import (
+    ResultsError,
+    evaluate,
+    export_policy,
+    load_policy,
+    make_policy,
+    run_benchmark,
+    train,
+    tune,
+)
 from baselines.policies.network import NetworkPolicy
 from baselines.report import render_report
 from baselines.sweeps.folder import read_run
 from benchmarks.trust import kills, malformed, observations, problems, repeat, soak
 from benchmarks.trust.__main__ import FIGURES, Outcome, table, try_out
+from controllers import CentralOptions, ConsensusOptions, LmpcOptions, SdcOptions
 from quad_envs import cooperative_estimation_v0
 
 HELIX = "quad/HelixTracking-v0"
@@ -105,3 +116,37 @@ def test_a_command_that_dies_is_counted_as_dead_and_goes_on(tmp_path):
     job = kills.JOBS[1]  # evaluate, the quickest
     found = list(itertools.islice(kills.kills(2, [job]), 3))
     assert [one.wrong for one in found] == [()] * 3
+
+
+WRONG = [
+    (lambda: quad_envs.RandomSmooth(amplitude=2.0), "amplitude must be several numbers, got 2.0"),
+    (lambda: quad_envs.Limits(position_lower=1.0), "position_lower must be three numbers, got 1.0"),
+    (lambda: quad_envs.Weights(Q="x"), "Q must be several numbers, got 'x'"),
+    (lambda: quad_envs.TorquePulse(start=[1.0]), "start must be a number, got"),
+    (lambda: quad_envs.Gusts(correlation_time="x"), "correlation_time must be a number, got 'x'"),
+    (lambda: quad_envs.Switching(graphs=3), "graphs must be a sequence, got 3"),
+    (lambda: quad_envs.Timed(["ring"], 3), "times must be several numbers, got 3"),
+    (lambda: quad_envs.StaticTarget({"x": 1}), "position of StaticTarget must be three finite numbers"),
+    (lambda: quad_envs.toward_leader(3), "G must be a square matrix of weights, got 3"),
+    (lambda: quad_envs.adjacency(10**7, []), "a graph of 10000000 vehicles would take"),
+    (lambda: LmpcOptions(margin="x"), "margin must be a number, got 'x'"),
+    (lambda: LmpcOptions(estimator_gain="x"), r"estimator_gain must be 'auto' or lie in \(0, 1\], got 'x'"),
+    (lambda: SdcOptions(alpha=None), "alpha must be a number, got None"),
+    (lambda: CentralOptions(swirl=[1.0]), "swirl must be a number, got"),
+    (lambda: ConsensusOptions(reach="x"), "reach must be a number, got 'x'"),
+    (lambda: load_policy(3, HELIX), "a checkpoint must be a path, got 3"),
+    (lambda: run_benchmark(3), "a suite, if no mapping, must be a path, got 3"),
+    (lambda: run_benchmark("quick", out=3), "out must be a path, got 3"),
+    (lambda: run_benchmark("quick", policies=[3]), r"policies must be a mapping of labels, got \[3\]"),
+    (lambda: evaluate("hover", HELIX, out=3), "out must be a path, got 3"),
+    (lambda: train(3, "ppo"), "env_id must be a text, got 3"),
+    (lambda: train(HELIX, "ppo", start_from=[1]), r"start_from must be a path, got \[1\]"),
+    (lambda: tune(HELIX, "lmpc", options=3), "options must be a mapping of names to values, got 3"),
+    (lambda: export_policy("model.zip", 3), "folder must be a path, got 3"),
+]
+
+
+@pytest.mark.parametrize(("make", "message"), WRONG, ids=[message for _, message in WRONG])
+def test_a_value_of_another_kind_is_refused_by_the_name_of_its_argument(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -14,6 +14,7 @@ from quad_envs.observations.features import Features, entry_names
 from quad_envs.tasks import TeamTask
 
 from ..errors import CheckpointError
+from ..files import require_path
 from .checkpoints import DESCRIPTION, save_checkpoint
 from .disturbance_estimate import sees_estimate, with_estimate
 from .environments import find_task, task_of
@@ -60,6 +61,7 @@ def export_policy(
         CheckpointError: If the source cannot be read or has other layers, is of another task than `env`, or
             the folder holds a checkpoint already.
     """
+    require_path("folder", folder)
     path = Path(folder)
     if (path / DESCRIPTION).exists() and not fresh:
         raise CheckpointError(

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from quad_envs.names import shown, unknown_name
 
 from ..errors import CheckpointError
+from ..files import require_path
 
 if TYPE_CHECKING:  # not at run time: tasks load numba, and `quad-envs list` has to be quick
     from quad_envs.tasks import TeamTask
@@ -154,7 +155,9 @@ def checkpoint_folder(source: str | os.PathLike[str]) -> Path:
 
     Raises:
         CheckpointError: If there is none.
+        ValueError: If it is no path.
     """
+    require_path("a checkpoint", source)
     text = os.fspath(source)
     if not isinstance(source, os.PathLike) and _is_shipped(text):
         return SHIPPED / text

@@ -12,7 +12,7 @@ from quad_envs.tasks import BaseTask, TeamTask
 
 from ..evaluation.episode import Episode
 from ..evaluation.evaluate import Evaluation, fly_and_measure
-from ..files import plain_json
+from ..files import plain_json, require_path
 from ..policies.environments import require_own_task
 from ..policies.outside import name_of
 from ..policies.protocol import Policy
@@ -64,6 +64,7 @@ def evaluate(
     """
     if out is None:
         return fly_and_measure(policy, env, episodes, seed, on_episode, mismatch=mismatch)
+    require_path("out", out)
     policy = os.fspath(policy) if isinstance(policy, os.PathLike) else policy
     choice = PolicyChoice(policy) if isinstance(policy, str) else _choice_of(policy)
     suite = Suite("evaluate", (_env_choice(env),), (choice,), episodes, seed)

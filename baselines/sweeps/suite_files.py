@@ -47,6 +47,7 @@ from typing import Any, TypeVar
 from quad_envs.names import shown, unknown_name
 from quad_envs.registration import TEAMS, TRACKING
 
+from ..files import require_path
 from ..policies.registry import TEAM_POLICIES, TRACKING_POLICIES, behind_filter, from_outside
 from ..policies.trained import names_trained
 from ..training.algorithms import ALGORITHMS
@@ -244,6 +245,7 @@ def load_suite(source: str | Path | Mapping[str, Any] | Suite) -> Suite:
         return source
     if isinstance(source, Mapping):
         return suite_from_dict(source)
+    require_path("a suite, if no mapping,", source)
     path = Path(source)
     if path.suffix == ".toml":
         if not path.is_file():

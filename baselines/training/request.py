@@ -9,6 +9,7 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
 
+from ..files import require_mappings, require_path, require_words
 from .watching import Watcher
 
 
@@ -41,6 +42,11 @@ class TrainingRequest:
     watcher: Watcher | None = None  # hears of the progress
 
     def __post_init__(self) -> None:
+        require_words(env_id=self.env_id, algorithm=self.algorithm)
+        require_mappings(env_kwargs=self.env_kwargs, hyper=self.hyper)
+        for what in ("out", "start_from"):
+            if getattr(self, what) is not None:
+                require_path(what, getattr(self, what))
         if self.resume and self.fresh:
             raise ValueError("either resume or fresh: a run that is discarded cannot go on")
 

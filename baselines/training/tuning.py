@@ -29,7 +29,17 @@ from quad_envs.parameters import Array
 
 from ..errors import ResultsError, TrainingError
 from ..evaluation.evaluate import fly_and_measure
-from ..files import locked, plain_json, provenance, read_json, write_csv, write_json
+from ..files import (
+    locked,
+    plain_json,
+    provenance,
+    read_json,
+    require_mappings,
+    require_path,
+    require_words,
+    write_csv,
+    write_json,
+)
 from ..interruptions import held, raise_lost, remembered
 from ..policies.registry import make_policy
 from ..policies.tuned import DESCRIPTION, TunedPolicy, vehicle_of, write_tuned
@@ -71,6 +81,10 @@ class TuningRequest:
     watcher: Watcher | None = None  # hears of the progress
 
     def __post_init__(self) -> None:
+        require_words(env_id=self.env_id, policy=self.policy)
+        require_mappings(env_kwargs=self.env_kwargs, options=self.options)
+        if self.out is not None:
+            require_path("out", self.out)
         require_choice("objective", self.objective, Objective)
         require_whole("seed of a tuning", self.seed, 0, 99)
         if self.resume and self.fresh:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quad_envs.checks import require_choice, require_whole
+from quad_envs.kinds import is_number, require_kinds
 from quad_envs.limits import Limits
 from quad_envs.names import shown, unknown_name
 
@@ -62,6 +63,7 @@ class FactorisationOptions:
     alpha: float = 1.0  # member of the family of factorisations, in [0, 1]; 1/2 is the dissertation's
 
     def __post_init__(self) -> None:
+        require_kinds(self)
         require_alpha(self.alpha)
 
 
@@ -83,6 +85,7 @@ class ProblemOptions:
     terminal: ArrayLike = 1.0  # factor of P, the weight of x_N, or a matrix (12, 12) in the problem's axes
 
     def __post_init__(self) -> None:
+        require_kinds(self)
         require_horizon(self.horizon)
         if not self.soft_weight >= 0.0:
             raise ValueError(
@@ -116,7 +119,8 @@ class VehicleMpcOptions(ProblemOptions):
 
     def __post_init__(self) -> None:
         ProblemOptions.__post_init__(self)
-        if self.estimator_gain != "auto" and not 0.0 < self.estimator_gain <= 1.0:
+        own = self.estimator_gain != "auto"
+        if own and not (is_number(self.estimator_gain) and 0.0 < self.estimator_gain <= 1.0):
             raise ValueError(
                 f"estimator_gain must be 'auto' or lie in (0, 1], got {shown(self.estimator_gain)}"
             )
@@ -274,6 +278,7 @@ class NmpcOptions(MpcOptions):
     usual_tilt: ClassVar[float] = EXACT_TILT
 
     def __post_init__(self) -> None:
+        require_kinds(self)
         require_whole("passes", self.passes, 1, MOST_PASSES)
         require_choice("velocity_error", self.velocity_error, VelocityError)
         MpcOptions.__post_init__(self)

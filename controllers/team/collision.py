@@ -40,6 +40,7 @@ import numpy as np
 
 from quad_envs.checks import require_choice
 from quad_envs.compilation.decorators import inline_kernel, kernel
+from quad_envs.kinds import require_kinds
 from quad_envs.names import shown
 from quad_envs.observations.team import COMM_AGE, COMM_WEIGHT, N_COMM, N_PLAN_STAGE
 from quad_envs.parameters import N_STATE, Array
@@ -85,6 +86,7 @@ class SeparationOptions:
     separation_weight: float = 1e3  # exact penalty per metre of a separation row
 
     def __post_init__(self) -> None:
+        require_kinds(self)
         if not 0.0 <= self.braking < math.inf:
             raise ValueError(f"braking_time must be finite and >= 0 s, got {shown(self.braking_time)}")
         if not abs(self.swirl) < math.pi / 2:

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 
 from quad_envs.checks import require_choice
 from quad_envs.compilation.decorators import kernel
+from quad_envs.kinds import require_kinds
 from quad_envs.observations.team import N_COMM, N_PLAN_STAGE
 from quad_envs.observations.tracking import N_REFERENCE
 from quad_envs.parameters import Array
@@ -53,6 +54,7 @@ class NeighbourOptions:
     speed: float = 2.0  # m/s, governor: largest velocity reference, above the leader's; inf for none
 
     def __post_init__(self) -> None:
+        require_kinds(self)
         require_choice("neighbour", self.neighbour, Neighbour)
         if self.attitude and self.neighbour != "ca":
             raise ValueError(

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from ..checks import require_whole
 from ..compilation.decorators import entry_of, inline_kernel, kernel
 from ..compilation.packed import IntArray
+from ..kinds import require_kinds
 from ..names import shown
 from ..observations.tracking import N_REFERENCE
 from ..parameters import Array
@@ -262,6 +263,7 @@ class RandomSmooth:
     random: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
+        require_kinds(self)
         if not 0.0 < self.rate_min <= self.rate_max:
             raise ValueError(
                 f"need 0 < rate_min <= rate_max, got {shown(self.rate_min)} and {shown(self.rate_max)} rad/s"
