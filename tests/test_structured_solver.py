@@ -18,6 +18,7 @@ from controllers.qp.ocp import (
 from controllers.qp.recursion import Feedback
 from controllers.qp.structured import inverse_factor, solve_structured
 from controllers.qp.workspace import make_workspace
+from quad_envs.compilation.packed import pack
 
 SOLVER = StructuredSolver()
 FAR = np.r_[3.0, 3.0, 3.0, np.zeros(9)]
@@ -97,7 +98,7 @@ def test_the_unconstrained_plan_is_the_solution_of_the_condensed_system(model):
 def test_the_inverse_factor_whitens_the_hessian(model, N):
     qp = random_qp(np.random.default_rng(8), N, model, "none")
     ws = make_workspace(N, 0, len(qp.A))
-    solve_structured(*qp[:-2], *qp.rows, rate_weight(qp), 1, False, ws)
+    solve_structured(*qp[:-2], *qp.rows, rate_weight(qp), 1, False, pack(ws))
     J_T = np.empty((4 * N, 4 * N))
     feedback = Feedback(ws.transposed, ws.K, ws.D, ws.P_c)
     inverse_factor(qp.A, qp.B, qp.stationary, feedback, ws.K, J_T, ws.wide, ws.scratch)
@@ -220,14 +221,15 @@ def test_a_number_that_is_not_finite_is_a_status_of_the_kernel(field):
     broken = getattr(qp, field).copy()
     broken.flat[0] = np.nan
     qp = qp._replace(**{field: broken})
-    status, _ = solve_structured(*qp[:-2], *qp.rows, rate_weight(qp), 100, False, make_workspace(5, 0, 1))
+    ws = make_workspace(5, 0, 1)
+    status, _ = solve_structured(*qp[:-2], *qp.rows, rate_weight(qp), 100, False, pack(ws))
     assert status == Status.NOT_FINITE
 
 
 def test_a_workspace_of_another_horizon_is_refused():
     qp = hover_qp(5, FAR)
     with pytest.raises(ValueError, match="workspace does not fit"):
-        solve_structured(*qp[:-2], *qp.rows, rate_weight(qp), 100, False, make_workspace(4, 0, 1))
+        solve_structured(*qp[:-2], *qp.rows, rate_weight(qp), 100, False, pack(make_workspace(4, 0, 1)))
 
 
 def test_repeated_solves_in_one_workspace_are_bitwise_equal():

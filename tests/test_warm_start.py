@@ -12,6 +12,7 @@ from controllers.qp.ocp import rate_weight
 from controllers.qp.structured import ITERATION_LIMIT, solve_structured, step_limit
 from controllers.qp.working_set import DIGITS, pack_working_set, unpack_working_set
 from controllers.qp.workspace import make_workspace
+from quad_envs.compilation.packed import pack
 
 SOLVER = StructuredSolver()
 
@@ -23,7 +24,7 @@ def solve_from(qp, guess):
     if guess is not None:
         ws.guess[:] = guess
     status, steps = solve_structured(
-        *qp[:-2], *qp.rows, rate_weight(qp), ITERATION_LIMIT, guess is not None, ws
+        *qp[:-2], *qp.rows, rate_weight(qp), ITERATION_LIMIT, guess is not None, pack(ws)
     )
     return Status(status), steps, ws.u.copy(), ws.state.copy()
 

@@ -7,7 +7,7 @@ out the second derivatives of e.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from quad_envs.compilation.decorators import entry_of, kernel, threaded_kernel
 from quad_envs.compilation.packed import unpacker
@@ -25,7 +25,6 @@ from .kernels import (
     MpcData,
     Scratch,
     begin_row,
-    carve,
     copy_vector,
     end_row,
     left_model,
@@ -201,7 +200,7 @@ class _Call(NamedTuple):
     floor: float  # of the stage weights, see `score.weigh_stages`
     keep_from: int  # where the guess begins in memory
     data: MpcData
-    buffer: Annotated[Array, "numbers"]
+    s: Scratch
     ws: Workspace
 
 
@@ -222,13 +221,11 @@ def _decide_rows(
     words: IntArray,
 ) -> int:
     """One decision per row; -1, or the code of the first argument that is not finite."""
-    passes, inertial, floor, keep_from, data, buffer, ws = _unpack(words)
+    passes, inertial, floor, keep_from, data, s, ws = _unpack(words)
     N = ws.u.shape[0]
     bad = first_non_finite(plants, windows, lasts, disturbances, memories, N + 1)
     if bad >= 0:
         return bad
-    H, K = data.normals.shape[0], data.normal.shape[0]
-    s = carve(buffer, N, N, H, K, N)
     for j in range(plants.shape[0]):
         begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
         begin_passes(floor, memories[j], memories[j, keep_from:], data.heading, s)
@@ -273,8 +270,8 @@ class ExactNmpc(Mpc):
         self.passes = int(options.passes)
         self._inertial = options.velocity_error == "inertial"
 
-    def _call(self, buffer: Array, ws: Workspace) -> _Call:
-        return _Call(self.passes, self._inertial, self._floor, self._keep_from, self._data, buffer, ws)
+    def _call(self, s: Scratch, ws: Workspace) -> _Call:
+        return _Call(self.passes, self._inertial, self._floor, self._keep_from, self._data, s, ws)
 
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
         if number == 0:

@@ -11,6 +11,8 @@ from __future__ import annotations
 import math
 from typing import Annotated, NamedTuple
 
+import numpy as np
+
 from quad_envs.compilation.decorators import kernel
 from quad_envs.parameters import HOVER_FORCE, N_INPUT, N_STATE, Array
 from quad_envs.rotations import sincos
@@ -19,7 +21,7 @@ from ..disturbance import ESTIMATOR_SCRATCH, N_DISTURBANCE, feed_forward, rememb
 from ..fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, RELAXED, RELAXED_WEIGHT, limit_command
 from ..frame import add_rotor_lag, level_velocity, set_references, set_state, turn_rows
 from ..qp.active_set import INACCURATE, INFEASIBLE, OPTIMAL
-from ..qp.linalg import copy, take, take_blocks
+from ..qp.linalg import copy
 from ..qp.ocp import IntArray, OcpQp, StateRows
 from ..qp.riccati import DARE_SCRATCH
 from ..qp.structured import solve_qp
@@ -68,46 +70,51 @@ class MpcData(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """One sample's problem and the memory to make it, carved from one flat buffer."""
+    """One sample's problem and the memory to make it."""
 
-    x_0: Array  # (12,)
-    trim: Array  # (12,), equilibrium under the disturbance
-    offset: Array  # (4,), equilibrium rotor forces; u = F - offset
-    lower: Array  # (4,), of u
-    upper: Array  # (4,)
-    u_last: Array  # (4,)
-    d: Array  # (6,), disturbance in the axes of the problem
-    estimate: Array  # (6,), of what is not revealed
-    r: Array  # (N+1, 12)
-    c: Array  # (N, 12)
-    A: Array  # (1 or N, 12, 12)
-    B: Array  # (1 or N, 12, 4)
-    normals: Array  # (H, 12)
-    row_lower: Array  # (K,)
-    row_upper: Array  # (K,)
-    weight: Array  # (K,)
-    A_c: Array  # (12, 12)
-    P: Array  # (12, 12)
-    square: Array  # (DARE_SCRATCH, 12, 12)
-    work: Array  # (ESTIMATOR_SCRATCH,)
-    working: Array  # (N,), working set of the solver, one number per stage
-    Q: Array  # (M, 12, 12), stage weights; M = N where a guess is kept, else 0
-    R: Array  # (M, 4, 4), those of the inputs
-    target: Array  # (M+1, 12), references that go with them
-    X: Array  # (M+1, 12), guess of the states
-    F: Array  # (M, 4), and of the rotor forces
-    points: Array  # (1 or N, 12), states at which the pairs were taken; hover: zeros
-    loss: Array  # (M,), stage costs l(x_{i+1}, u_i) of the guess
-    floor: Array  # (1,), least weight of a stage in the next pass, see `score.weigh_stages`
+    x_0: Annotated[Array, "12"]
+    trim: Annotated[Array, "12"]  # equilibrium under the disturbance
+    offset: Annotated[Array, "4"]  # equilibrium rotor forces; u = F - offset
+    lower: Annotated[Array, "4"]  # of u
+    upper: Annotated[Array, "4"]
+    u_last: Annotated[Array, "4"]
+    d: Annotated[Array, "6"]  # disturbance in the axes of the problem
+    estimate: Annotated[Array, "6"]  # of what is not revealed
+    r: Annotated[Array, "N+1, 12"]
+    c: Annotated[Array, "N, 12"]
+    A: Annotated[Array, "1 or N, 12, 12"]
+    B: Annotated[Array, "1 or N, 12, 4"]
+    normals: Annotated[Array, "H, 12"]
+    row_lower: Annotated[Array, "K"]
+    row_upper: Annotated[Array, "K"]
+    weight: Annotated[Array, "K"]
+    A_c: Annotated[Array, "12, 12"]
+    P: Annotated[Array, "12, 12"]
+    square: Annotated[Array, "DARE_SCRATCH, 12, 12"]
+    work: Annotated[Array, "ESTIMATOR_SCRATCH"]
+    working: Annotated[Array, "N"]  # working set of the solver, one number per stage
+    Q: Annotated[Array, "M, 12, 12"]  # stage weights; M = N where a guess is kept, else 0
+    R: Annotated[Array, "M, 4, 4"]  # those of the inputs
+    target: Annotated[Array, "M+1, 12"]  # references that go with them
+    X: Annotated[Array, "M+1, 12"]  # guess of the states
+    F: Annotated[Array, "M, 4"]  # and of the rotor forces
+    points: Annotated[Array, "1 or N, 12"]  # states at which the pairs were taken; hover: zeros
+    loss: Annotated[Array, "M"]  # stage costs l(x_{i+1}, u_i) of the guess
+    floor: Annotated[Array, "1"]  # least weight of a stage in the next pass, see `score.weigh_stages`
 
 
-def buffer_size(N: int, pairs: int, H: int, K: int, M: int) -> int:
-    """Numbers that `carve` needs."""
-    n, m = N_STATE, N_INPUT
-    vectors = 2 * n + 4 * m + 2 * N_DISTURBANCE + ESTIMATOR_SCRATCH
-    stages = n * (2 * N + 1) + pairs * n * (n + m) + n * H + 3 * K
-    guess = M * (n * n + m * m) + 2 * n * (M + 1) + m * M + M + 1
-    return vectors + N + stages + (2 + DARE_SCRATCH) * n * n + guess + pairs * n
+def make_scratch(N: int, pairs: int, H: int, K: int, M: int) -> Scratch:
+    """Memory for samples with a horizon N, so many pairs, H normals, K rows and a guess of M stages."""
+    n, m, e = N_STATE, N_INPUT, N_DISTURBANCE
+    shapes: dict[str, tuple[int, ...]] = {
+        "x_0": (n,), "trim": (n,), "offset": (m,), "lower": (m,), "upper": (m,), "u_last": (m,),
+        "d": (e,), "estimate": (e,), "r": (N + 1, n), "c": (N, n), "A": (pairs, n, n), "B": (pairs, n, m),
+        "normals": (H, n), "row_lower": (K,), "row_upper": (K,), "weight": (K,), "A_c": (n, n), "P": (n, n),
+        "square": (DARE_SCRATCH, n, n), "work": (ESTIMATOR_SCRATCH,), "working": (N,), "Q": (M, n, n),
+        "R": (M, m, m), "target": (M + 1, n), "X": (M + 1, n), "F": (M, m), "points": (pairs, n),
+        "loss": (M,), "floor": (1,),
+    }  # fmt: skip
+    return Scratch(**{name: np.zeros(shape) for name, shape in shapes.items()})
 
 
 @kernel
@@ -115,51 +122,6 @@ def copy_vector(x: Array, out: Array) -> None:
     """As `linalg.copy`, for vectors."""
     for i in range(out.shape[0]):
         out[i] = x[i]
-
-
-@kernel
-def carve(buffer: Array, N: int, pairs: int, H: int, K: int, M: int) -> Scratch:
-    """Views of the buffer; one array is unpacked at the call from Python instead of two dozen."""
-    n, m, e = N_STATE, N_INPUT, N_DISTURBANCE
-    v = take(buffer, 0, 1, 2 * n + 4 * m + 2 * e + ESTIMATOR_SCRATCH)[0]
-    i = v.shape[0]
-    working = take(buffer, i, 1, N)[0]
-    i += N
-    r = take(buffer, i, N + 1, n)
-    i += r.size
-    c = take(buffer, i, N, n)
-    i += c.size
-    A = take_blocks(buffer, i, pairs, n, n)
-    i += A.size
-    B = take_blocks(buffer, i, pairs, n, m)
-    i += B.size
-    square = take_blocks(buffer, i, 2 + DARE_SCRATCH, n, n)
-    i += square.size
-    normals = take(buffer, i, H, n)
-    i += normals.size
-    rows = take(buffer, i, 3, K)
-    i += rows.size
-    Q = take_blocks(buffer, i, M, n, n)
-    i += Q.size
-    R = take_blocks(buffer, i, M, m, m)
-    i += R.size
-    target = take(buffer, i, M + 1, n)
-    i += target.size
-    X = take(buffer, i, M + 1, n)
-    i += X.size
-    F = take(buffer, i, M, m)
-    i += F.size
-    points = take(buffer, i, pairs, n)
-    i += points.size
-    loss = take(buffer, i, 1, M)[0]
-    floor = take(buffer, i + M, 1, 1)[0]
-    o = 2 * n + 4 * m
-    return Scratch(
-        v[:n], v[n : 2 * n], v[2 * n : 2 * n + m], v[2 * n + m : 2 * n + 2 * m],
-        v[2 * n + 2 * m : 2 * n + 3 * m], v[2 * n + 3 * m : o], v[o : o + e], v[o + e : o + 2 * e],
-        r, c, A, B, normals, rows[0], rows[1], rows[2], square[0], square[1], square[2:], v[o + 2 * e :],
-        working, Q, R, target, X, F, points, loss, floor,
-    )  # fmt: skip
 
 
 @kernel

@@ -19,7 +19,6 @@ from .kernels import (
     MpcData,
     Scratch,
     begin_row,
-    carve,
     end_row,
     hold_trim,
     left_model,
@@ -38,7 +37,7 @@ class _Call(NamedTuple):
     stationary: bool  # whether data.P solves the Riccati equation of the pair
     floor: float  # of the stage weights, see `score.weigh_stages`
     data: MpcData
-    buffer: Annotated[Array, "numbers"]
+    s: Scratch
     ws: Workspace
 
 
@@ -59,13 +58,11 @@ def _decide_rows(
     words: IntArray,
 ) -> int:
     """One decision per row; -1, or the code of the first argument that is not finite."""
-    A, B, stationary, floor, data, buffer, ws = _unpack(words)
+    A, B, stationary, floor, data, s, ws = _unpack(words)
     N = ws.u.shape[0]
     bad = first_non_finite(plants, windows, lasts, disturbances, memories, N + 1)
     if bad >= 0:
         return bad
-    H, K = data.normals.shape[0], data.normal.shape[0]
-    s = carve(buffer, N, A.shape[0], H, K, N if floor < COST_FLOOR else 0)
     for j in range(plants.shape[0]):
         begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
         hold_trim(A, s.trim, s.c)
@@ -108,8 +105,8 @@ class LinearMPC(Mpc):
         self._A, self._B = (np.repeat(matrix[None], self._pairs, axis=0) for matrix in (A, B))
         self._stationary = not options.own_terminal and self._pairs == 1
 
-    def _call(self, buffer: Array, ws: Workspace) -> _Call:
-        return _Call(self._A, self._B, self._stationary, self._floor, self._data, buffer, ws)
+    def _call(self, s: Scratch, ws: Workspace) -> _Call:
+        return _Call(self._A, self._B, self._stationary, self._floor, self._data, s, ws)
 
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
         data = self._data

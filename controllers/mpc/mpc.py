@@ -38,11 +38,10 @@ from .kernels import (
     MpcData,
     Scratch,
     begin_row,
-    buffer_size,
-    carve,
     end_row,
     leaves_bound,
     left_model,
+    make_scratch,
 )
 from .options import PLAN_TILT, MpcOptions, VelocityAxes
 from .score import COST_FLOOR
@@ -56,7 +55,7 @@ class _Memory(NamedTuple):
     """What a thread decides with."""
 
     which: IntArray | None  # what `begin_row` takes for the estimator
-    buffer: Array  # of `carve`
+    s: Scratch
     ws: Workspace
     call: Any  # what lies behind the words
     words: IntArray  # all that a kernel takes beside its rows
@@ -244,8 +243,7 @@ class Mpc(ABC):
             ValueError: If a shape is wrong or a number is not finite.
         """
         row = as_one_row(plant, window, last_command, disturbance, memory, self.horizon + 1, self.memory_size)
-        which, buffer, ws, *_ = self._scratch()
-        s = carve(buffer, self.horizon, *self._sizes())
+        which, s, ws, *_ = self._scratch()
         begin_row(*row, which, self._data, s)
         qp = self._as_qp(self._pose(0, row[-1], s, ws), s, *self._row_sets()[0])
         rows = StateRows._make(np.array(value) for value in qp.rows)
@@ -270,7 +268,7 @@ class Mpc(ABC):
         return self._threads.run(rows, work)
 
     @abstractmethod
-    def _call(self, buffer: Array, ws: Workspace) -> Any:
+    def _call(self, s: Scratch, ws: Workspace) -> Any:
         """What the kernel takes beside its rows, a NamedTuple for `pack`."""
 
     @abstractmethod
@@ -288,11 +286,11 @@ class Mpc(ABC):
         """Scratch memory of a thread, made at need."""
         while len(self._memories) <= thread:
             which = np.zeros(1, np.int64) if self.options.reject_disturbance else None
-            buffer = np.zeros(buffer_size(self.horizon, *self._sizes()))
+            s = make_scratch(self.horizon, *self._sizes())
             rows, weighs_changes = len(self._data.normal), len(self._data.R_rate) > 0
             ws = make_workspace(self.horizon, rows, self._pairs, weighs_changes)
-            call = self._call(buffer, ws)
-            self._memories.append(_Memory(which, buffer, ws, call, pack(call)))
+            call = self._call(s, ws)
+            self._memories.append(_Memory(which, s, ws, call, pack(call)))
         return self._memories[thread]
 
     def _sizes(self) -> tuple[int, int, int, int]:
@@ -305,8 +303,7 @@ class Mpc(ABC):
         bad = first_non_finite(plants, windows, lasts, disturbances, memories, self.horizon + 1)
         if bad >= 0:
             return bad
-        which, buffer, ws, *_ = self._scratch()
-        s = carve(buffer, self.horizon, *self._sizes())
+        which, s, ws, *_ = self._scratch()
         for j in range(len(plants)):
             row = plants[j], windows[j], lasts[j], disturbances[j], memories[j]
             begin_row(*row, which, self._data, s)

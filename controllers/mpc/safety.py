@@ -13,7 +13,7 @@ to which the present forces bring the vehicle by then.
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,7 +33,7 @@ from ..qp.ocp import IntArray
 from ..qp.recursion import Feedback, Regulator, optimal_plan, riccati_pass
 from ..qp.workspace import Workspace
 from .exact import CONVERGED, ExactNmpc, keep_guess, linearise_cost, linearise_model, load_guess, take_step
-from .kernels import MpcData, Scratch, begin_row, carve, copy_vector, end_row, left_model, solve_within_model
+from .kernels import MpcData, Scratch, begin_row, copy_vector, end_row, left_model, solve_within_model
 from .options import NmpcOptions, SafetyOptions
 
 KEPT = 5e-3  # N, difference of a rotor's command up to which it counts as the wanted one, and becomes it
@@ -162,7 +162,7 @@ class _Call(NamedTuple):
     weight: float  # 1/N^2, as of `draw_first_input`
     delay: float  # s, as of `run_on`
     data: MpcData
-    buffer: Annotated[Array, "numbers"]
+    s: Scratch
     ws: Workspace
 
 
@@ -185,12 +185,11 @@ def _filter_rows(
     words: IntArray,
 ) -> int:
     """One correction per row; -1, or the code of the first argument that is not finite."""
-    passes, inertial, keep_from, weight, delay, data, buffer, ws = _unpack(words)
+    passes, inertial, keep_from, weight, delay, data, s, ws = _unpack(words)
     N = ws.u.shape[0]
     bad = first_non_finite(plants, windows, lasts, disturbances, memories, N + 1)
     if bad >= 0:
         return bad
-    s = carve(buffer, N, N, data.normals.shape[0], data.normal.shape[0], N)
     for j in range(plants.shape[0]):
         begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
         run_on(plants[j], delay, data, s)
@@ -251,11 +250,9 @@ class SafetyFilter(ExactNmpc):
         self._data = grow_margin(self._data._replace(lag=0.0), float(self.options.margin))
         self._delay = 1.0 / float(task.params.rotor_rate)
 
-    def _call(self, buffer: Array, ws: Workspace) -> Any:
+    def _call(self, s: Scratch, ws: Workspace) -> Any:
         weight = float(self.options.weight)
-        return _Call(
-            self.passes, self._inertial, self._keep_from, weight, self._delay, self._data, buffer, ws
-        )
+        return _Call(self.passes, self._inertial, self._keep_from, weight, self._delay, self._data, s, ws)
 
     def decide(
         self,

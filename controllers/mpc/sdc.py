@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from quad_envs.compilation.decorators import entry_of, kernel, threaded_kernel
 from quad_envs.compilation.packed import unpacker
@@ -21,7 +21,6 @@ from .kernels import (
     MpcData,
     Scratch,
     begin_row,
-    carve,
     copy_vector,
     end_row,
     hold_trim,
@@ -146,7 +145,7 @@ class _Call(NamedTuple):
     sdre_weight: bool  # whether the terminal weight is that of the present pair
     floor: float  # of the stage weights, see `score.weigh_stages`
     data: MpcData
-    buffer: Annotated[Array, "numbers"]
+    s: Scratch
     ws: Workspace
 
 
@@ -167,23 +166,19 @@ def _decide_rows(
     words: IntArray,
 ) -> int:
     """One decision per row; -1, or the code of the first argument that is not finite."""
-    alpha, present, relinearisations, at_need, sdre_weight, floor, data, buffer, ws = _unpack(words)
+    alpha, present, relinearisations, at_need, sdre_weight, floor, data, s, ws = _unpack(words)
     N = ws.u.shape[0]
     bad = first_non_finite(plants, windows, lasts, disturbances, memories, N + 1)
     if bad >= 0:
         return bad
-    weighs = floor < COST_FLOOR
-    first = N if weighs and data.R_rate.shape[0] > 0 else 1  # pairs of the first pass
-    H, K = data.normals.shape[0], data.normal.shape[0]
-    s = carve(buffer, N, N if relinearisations > 0 else first, H, K, N if weighs else 0)
+    first = N if floor < COST_FLOOR and data.R_rate.shape[0] > 0 else 1  # pairs of the first pass
     for j in range(plants.shape[0]):
         begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
-        worst, iterations = 0, 0
+        worst, iterations, pairs = 0, 0, first
         stationary = freeze_model(alpha, present, sdre_weight, data, s) and first == 1
         spread_pair(first, s)
         begin_guess(floor, memories[j], s)
         for k in range(1 + relinearisations):
-            pairs = first
             if k > 0:
                 relinearise(ws.u, alpha, present, data, s)
                 guess_plan(floor, ws.u, s)
@@ -235,10 +230,10 @@ class SdcNmpc(Mpc):
         self._first = self.horizon if self._floor < COST_FLOOR and len(self._data.R_rate) > 0 else 1
         self._refused, self._stationary, self._posed, self._taken = False, False, 1, 0  # see `_pose`
 
-    def _call(self, buffer: Array, ws: Workspace) -> _Call:
+    def _call(self, s: Scratch, ws: Workspace) -> _Call:
         passes = self.relinearisations, self._at_need
         weights = self._sdre_weight, self._floor
-        return _Call(self.alpha, self._present, *passes, *weights, self._data, buffer, ws)
+        return _Call(self.alpha, self._present, *passes, *weights, self._data, s, ws)
 
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
         data = self._data

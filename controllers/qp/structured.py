@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from quad_envs.compilation.decorators import kernel, separate_kernel
+from quad_envs.compilation.packed import pack, viewer
 from quad_envs.parameters import N_INPUT, Array
 
 from .active_set import (
@@ -390,6 +391,9 @@ def solve_qp(qp: OcpQp, iteration_limit: int, warm: bool, ws: Workspace) -> tupl
     return status, iterations
 
 
+_workspace = viewer(Workspace)
+
+
 @kernel
 def solve_structured(
     A: Array,
@@ -414,12 +418,12 @@ def solve_structured(
     R_rate: Array,
     iteration_limit: int,
     warm: bool,
-    ws: Workspace,
+    words: IntArray,
 ) -> tuple[int, int]:
-    """`solve_qp` for calls from Python: fields of `OcpQp` and `StateRows` one by one unpack twice as fast."""
+    """`solve_qp` for calls from Python: the problem in its fields, and the workspace as packed words."""
     rows = StateRows(normals, normal, stage, row_lower, row_upper, weight)
     qp = OcpQp(A, B, c, Q, R, Q_f, stationary, x_0, r, lower, upper, rate_step, u_last, rows, R_rate)
-    return solve_qp(qp, iteration_limit, warm, ws)
+    return solve_qp(qp, iteration_limit, warm, _workspace(words))
 
 
 class StructuredSolver:
@@ -447,9 +451,8 @@ class StructuredSolver:
         rows = qp.rows
         N, K = len(qp.c), len(rows.normal)
         ws = self._fitting_workspace(N, K, len(qp.A), qp.R_rate is not None)
-        status, iterations = solve_structured(
-            *qp[:-4], float(qp.rate_step), qp.u_last, *rows, rate_weight(qp), self.iteration_limit, False, ws
-        )
+        fields = *qp[:-4], float(qp.rate_step), qp.u_last, *rows, rate_weight(qp)
+        status, iterations = solve_structured(*fields, self.iteration_limit, False, pack(ws))
         nv = N_INPUT * N
         edges = [nv, 2 * nv, 3 * nv, 4 * nv, 4 * nv + K]
         parts = np.split(ws.multipliers[: 4 * nv + 2 * K].copy(), edges)

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quad_envs.compilation.packed import pack
 from quad_envs.observations.team import N_PLAN_STAGE, N_SENSED
 from quad_envs.observations.tracking import N_REFERENCE
 from quad_envs.parameters import N_INPUT, Array
@@ -24,7 +25,7 @@ from quad_envs.tasks import TeamTask
 
 from ..controller import PLANT_SIZE, as_array
 from ..disturbance import ESTIMATOR_SIZE, N_DISTURBANCE
-from ..mpc.kernels import MEMORY_STAGE, buffer_size, carve
+from ..mpc.kernels import MEMORY_STAGE, make_scratch
 from ..mpc.mpc import mpc_data
 from ..mpc.options import MpcOptions, chosen, shared
 from ..qp.ocp import IntArray, OcpQp, StateRows, concatenate_rows
@@ -32,7 +33,7 @@ from ..qp.workspace import make_workspace
 from .collision import COLLISION_SCRATCH
 from .consensus import require_messages
 from .consensus_kernels import CONSENSUS_SCRATCH
-from .cooperative_kernels import NAMES, RowLayout, Team, decide_team, pose_row
+from .cooperative_kernels import NAMES, RowLayout, Team, TeamCall, decide_team, pose_row
 from .options import CooperativeOptions
 from .situation import TeamSituation
 
@@ -78,7 +79,7 @@ class CooperativeMpc:
         self._prepare()
         estimator = ESTIMATOR_SIZE if self.options.reject_disturbance else 0
         self.memory_size = 1 + (MEMORY_STAGE + N_PLAN_STAGE) * self.horizon + estimator
-        self._workspace: tuple[Any, ...] | None = None
+        self._memory: tuple[IntArray | None, TeamCall, IntArray] | None = None
 
     def _prepare(self) -> None:
         """Constants for the kernels: the rows of the limits, then those of every slot."""
@@ -98,7 +99,7 @@ class CooperativeMpc:
             alpha, alpha if options.turning else 0.0, options.terminal_weight == "stage",
             len(limits.normals), len(limits.normal),
             len(separation.normals) // max(slots, 1), len(separation.normal) // max(slots, 1),
-            task.layout.comm_size, 1,
+            task.layout.comm_size,
         )  # fmt: skip
         self._constants = (
             options.consensus_data(task.dt, task.params.gravity),
@@ -131,8 +132,8 @@ class CooperativeMpc:
         n, N = len(team[0]), self.horizon
         command, kept = np.empty((n, N_INPUT)), np.empty((n, self.memory_size))
         report = np.empty((3, n), np.int64)
-        which, *scratch = self._scratch()
-        bad = decide_team(team, command, kept, report, which, *self._constants, *scratch)
+        which, _, words = self._scratch()
+        bad = decide_team(team, command, kept, report, which, words)
         if bad >= 0:
             row, argument = divmod(bad, len(NAMES))
             remedy = (
@@ -145,11 +146,10 @@ class CooperativeMpc:
     def problems(self, situation: TeamSituation, memory: ArrayLike) -> list[OcpQp]:
         """The OCP-QP of each vehicle, in its heading frame; arguments as of `decide`. For study and tests."""
         team, found = self._as_team(situation, memory), []
-        which, buffer, work, _ = self._scratch()
-        data, layout = self._data, self._layout
-        s = carve(buffer, self.horizon, layout.pairs, len(data.normals), len(data.normal), 0)
+        which, call, _ = self._scratch()
+        data, s = self._data, call.s
         for j in range(len(team[0])):
-            H, K = pose_row(team, j, which, *self._constants, s, work)
+            H, K = pose_row(team, j, which, *call[:-1])
             rows = StateRows(
                 s.normals[:H].copy(),
                 data.normal[:K],
@@ -215,18 +215,20 @@ class CooperativeMpc:
             )
         return tuple(array.reshape(n, math.prod(array.shape[1:])) for array in arrays)
 
-    def _scratch(self) -> tuple[Any, ...]:
-        """What the kernels take for the estimator, as buffer and work space, and for the solver."""
-        if self._workspace is None:
+    def _scratch(self) -> tuple[IntArray | None, TeamCall, IntArray]:
+        """What `begin_row` takes for the estimator, all else that a decision takes, and its words."""
+        if self._memory is None:
             N, data = self.horizon, self._data
-            self._workspace = (
-                np.zeros(1, np.int64) if self.options.reject_disturbance else None,
-                np.zeros(buffer_size(N, 1, len(data.normals), len(data.normal), 0)),
+            call = TeamCall(
+                *self._constants,
+                make_scratch(N, 1, len(data.normals), len(data.normal), 0),
                 np.zeros((N_REFERENCE + 2) * (N + 1) + max(CONSENSUS_SCRATCH, 18 + COLLISION_SCRATCH)),
                 make_workspace(N, len(data.normal), 1, len(data.R_rate) > 0),
             )
-        return self._workspace
+            which = np.zeros(1, np.int64) if self.options.reject_disturbance else None
+            self._memory = which, call, pack(call)
+        return self._memory
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but scratch memory, which is made again when needed."""
-        return {**self.__dict__, "_workspace": None}
+        return {**self.__dict__, "_memory": None}

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
-from quad_envs.compilation.decorators import kernel
+from quad_envs.compilation.decorators import entry_of, kernel
+from quad_envs.compilation.packed import unpacker
 from quad_envs.observations.team import N_PLAN_STAGE, N_SENSED
 from quad_envs.observations.tracking import N_REFERENCE
 from quad_envs.parameters import N_STATE, Array
@@ -17,7 +18,6 @@ from ..mpc.kernels import (
     MpcData,
     Scratch,
     begin_row,
-    carve,
     copy_vector,
     end_row,
     hold_trim,
@@ -49,7 +49,6 @@ class RowLayout(NamedTuple):
     slot_normals: int  # normals and rows of one vehicle to keep away from
     slot_rows: int
     message: int  # numbers in a comm slot
-    pairs: int  # 1, here because a literal would have `carve` compiled once more
 
 
 @kernel
@@ -195,27 +194,36 @@ def _write_plan(level: int, plant: Array, x: Array, old: Array, dt: float, plan:
             plan[m * i + 3], plan[m * i + 4], plan[m * i + 5] = v
 
 
+class TeamCall(NamedTuple):
+    """What a decision takes beside its rows."""
+
+    consensus: ConsensusData
+    avoidance: AvoidanceData
+    layout: RowLayout
+    data: MpcData
+    s: Scratch
+    work: Annotated[Array, "numbers"]  # of `pose_row`
+    ws: Workspace
+
+
+_unpack = unpacker(TeamCall)
+
+
 @kernel
-def decide_team(
+def _decide_team(
     team: Team,
     commands: Array,
     kept: Array,
     report: IntArray,
     which: IntArray | None,
-    consensus: ConsensusData,
-    avoidance: AvoidanceData,
-    layout: RowLayout,
-    data: MpcData,
-    buffer: Array,
-    work: Array,
-    ws: Workspace,
+    words: IntArray,
 ) -> int:
     """One decision per vehicle; -1, or the code of the first argument that is not finite."""
+    consensus, avoidance, layout, data, s, work, ws = _unpack(words)
     bad = first_non_finite_row(team)
     if bad >= 0:
         return bad
     N = ws.u.shape[0]
-    s = carve(buffer, N, layout.pairs, data.normals.shape[0], data.normal.shape[0], 0)
     for j in range(commands.shape[0]):
         H, K = pose_row(team, j, which, consensus, avoidance, layout, data, s, work)
         plant, memory = team[_PLANT][j], team[_MEMORY][j]
@@ -230,3 +238,6 @@ def decide_team(
         left = left_model(level, s.x_0, ws.x, s.points, data.model_tilt, data.first_angle)
         report[0, j], report[1, j], report[2, j] = level, iterations, left
     return bad
+
+
+decide_team = entry_of(_decide_team)
