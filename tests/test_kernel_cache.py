@@ -189,7 +189,7 @@ def test_a_cut_or_foreign_file_is_deleted_and_compiled_anew(tmp_path, monkeypatc
         again = fresh_kernel(tmp_path, monkeypatch)
         assert again(1.5) == 3.0
         assert sum(again.entry.stats.cache_misses.values()) == 1
-        assert file.stat().st_size == len(whole)
+        assert file.read_bytes() != broken
     again = fresh_kernel(tmp_path, monkeypatch)
     assert again(1.5) == 3.0 and sum(again.entry.stats.cache_hits.values()) == 1
 
@@ -299,21 +299,28 @@ class Pair(NamedTuple):
     table: np.ndarray
     total: float
 
+class Found(NamedTuple):
+    first: float
+    total: float
+
 @kernel
-def inner(n, gain):
+def inner(n, gain, table):
     if n > 9:
         raise ValueError("n must be at most 9")
-    table = np.arange(n) * gain
-    return table[::-1].copy()
+    for k in range(n):
+        table[k] = k * gain
+    return table[::-1]
 
 @kernel
 def outer(n, pair):
-    table = inner(n, pair.total)
-    return Pair(table + pair.table, np.sin(table).sum())
+    table, total = inner(n, pair.total, pair.table), 0.0
+    for k in range(n):
+        total += np.sin(table[k])
+    return Found(table[0] + 1.0, total)
 
 @kernel
 def other(x):
-    return np.linalg.norm(x) + np.sort(x)[0]
+    return np.dot(x, x) - x[0]
 
 print(outer(3, Pair(np.ones(3), 2.0)))
 try:
@@ -336,7 +343,7 @@ def test_kernels_found_again_need_no_compiler_and_others_compile_beside_them(tmp
         return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
 
     cold, warm, mixed = run(), run(), run("more")
-    said = "Pair(table=array([5., 3., 1.]), total=0.1524949"
+    said = "Found(first=5.0, total=0.1524949"
     assert cold.startswith(said) and "n must be at most 9" in cold
     assert "compiler loaded: True True" in cold
     assert warm == cold.replace("True True", "False False")
@@ -352,7 +359,7 @@ def test_kernels_are_compiled_where_no_c_compiler_can_be_found(tmp_path):
     done = subprocess.run(
         [sys.executable, str(script)], env=environment, capture_output=True, text=True, check=True
     )
-    assert "Pair(table" in done.stdout and list((tmp_path / "quad-envs").glob("*.nbc"))
+    assert "Found(first" in done.stdout and list((tmp_path / "quad-envs").glob("*.nbc"))
 
 
 def test_two_processes_that_compile_at_once_leave_whole_files(tmp_path):
@@ -364,7 +371,7 @@ def test_two_processes_that_compile_at_once_leave_whole_files(tmp_path):
         for _ in range(2)
     ]
     said = [process.communicate()[0] for process in both]
-    assert said[0] == said[1] and "Pair(table" in said[0] and "True True" in said[0]
+    assert said[0] == said[1] and "Found(first" in said[0] and "True True" in said[0]
     assert [path.suffix for path in (tmp_path / "quad-envs").iterdir()] == [".nbc"]
     third = subprocess.run(
         [sys.executable, str(script)], env=environment, capture_output=True, text=True, check=True

@@ -382,16 +382,16 @@ def gather_rows(
     age: Array,
     valid: NDArray[np.bool_],
     held: Counts,
+    motion: Array,
 ) -> None:
     """What a filter of the user's is given: ways (n, 3), and the measurements held with their places.
 
     Arguments up to `data` as in `filter_row`, for n rows; the own motion in the memory (n, >= FILTER_SIZE) is
-    brought up to date, and the way is zero in rows that begin an episode.
+    brought up to date, and the way is zero in rows that begin an episode; `motion` is overwritten, (6,).
     """
     n, m = valid.shape
     for j in range(n):
         comm = comms[j].reshape(comms.shape[1] // data.message, data.message)
-        motion = memory[j, _VELOCITY:FILTER_SIZE].copy()
         _own_motion(plants[j], disturbances[j], coefficients, motion)
         for a in range(3):
             way[j, a] = _way(motion, memory[j], data.dt, a) if memory[j, STAGE] > 0.0 else 0.0

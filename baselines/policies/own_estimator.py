@@ -78,7 +78,7 @@ class OwnEstimator:
         assert parts.measured.shape[1] == m * N_MEASURED
         gather_rows(
             parts.plant, parts.disturbance, parts.comm, parts.measured, filters, self._coefficients,
-            self._data, way, z, place, age, valid, held,
+            self._data, way, z, place, age, valid, held, np.empty(6),
         )  # fmt: skip
         own = self._moved_on(filters, parts.slot, way)
         predicted = self._believed(own)

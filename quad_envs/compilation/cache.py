@@ -37,6 +37,7 @@ except ImportError:  # Windows
 
 PACKAGES = ("quad_envs", "controllers", "baselines")
 _HEADER = hashlib.sha256().digest_size  # bytes before the kernel: its checksum
+_WAY = 2  # of compiling, in `nested` and `separate`: raised where it changes, so that no older file is loaded
 _OUTDATED = 7 * 86400.0  # s, after which another version of the same kernel is swept
 
 
@@ -193,7 +194,7 @@ class KernelCache:
         """Of the file, without its suffix, for these argument types."""
         if self._digest is None:
             self._digest = digest(self._kernel)[:16]
-        made_for = (_describe_signature(signature), _versions(), _settings(), processor)
+        made_for = (_describe_signature(signature), _versions(), _settings(), _WAY, processor)
         key = hashlib.sha256(repr(made_for).encode()).hexdigest()[:16]
         return f"{self._name}-{self._digest}-{key}"
 

@@ -21,7 +21,7 @@ from numba.core import config, event
 
 try:
     from .cache import PACKAGES, KernelCache, folder
-    from .nested import NestedKernel
+    from .nested import Kernel, NestedKernel
     from .separate import SeparateKernel
 except (ImportError, AttributeError) as error:  # a test hides the names in a process of its own
     warnings.warn(
@@ -32,7 +32,7 @@ except (ImportError, AttributeError) as error:  # a test hides the names in a pr
         stacklevel=2,
     )
     PACKAGES = ("quad_envs", "controllers", "baselines")
-    KernelCache = NestedKernel = SeparateKernel = None  # type: ignore[assignment, misc]
+    KernelCache = Kernel = NestedKernel = SeparateKernel = None  # type: ignore[assignment, misc]
 
 Int = int | np.int64  # an argument that a kernel may be given as a constant, see quad_envs.dynamics
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -48,7 +48,7 @@ def _compile(
         return cast(Function, SeparateKernel(function, {**options, "nogil": nogil}))
     if NestedKernel is None:
         return cast(Function, numba.njit(forceinline=inline, nogil=nogil, **options)(function))
-    entry = cast(Any, numba.njit(nogil=nogil, **options)(function))
+    entry: Any = Kernel(function, {**options, "nogil": nogil})
     entry._cache = KernelCache(entry)
     return cast(Function, NestedKernel(function, entry, inline, options))
 

@@ -14,29 +14,25 @@ import llvmlite.binding as llvm
 from numba.core import itanium_mangler
 from numba.core.base import BaseContext
 from numba.core.codegen import CPUCodeLibrary
-from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.compiler_machinery import register_pass
 from numba.core.funcdesc import qualifying_prefix
-from numba.core.registry import CPUDispatcher
 from numba.core.sigutils import normalize_signature
-from numba.core.typed_passes import NativeLowering
 
 from .cache import KernelCache
 from .kernel_file import publish
-from .nested import replace_pass
+from .nested import Kernel, KernelCompiler, KernelLowering
 
 for _owner, _name in (
     (BaseContext, "mangler"),
     (CPUCodeLibrary, "_get_module_for_linking"),
-    (DefaultPassBuilder, "define_nopython_pipeline"),
 ):
     if not hasattr(_owner, _name):
         raise ImportError(f"this version of numba has no {_owner.__name__}.{_name}")
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
-class _SeparateLowering(NativeLowering):
+class _SeparateLowering(KernelLowering):
     """Native lowering, in which the function gets the name of its file in the cache."""
 
     _name = "separate_lowering"
@@ -50,7 +46,7 @@ class _SeparateLowering(NativeLowering):
         own = qualifying_prefix(function.modname, function.func_qualname)
         context.mangler = partial(_mangle, own, name)
         try:
-            return bool(super().run_pass(state))  # type: ignore[no-untyped-call]
+            return super().run_pass(state)
         finally:
             del context.mangler
 
@@ -65,20 +61,19 @@ def _mangle(own: str, name: str, what: str, types: Any, **tags: Any) -> str:
     return str(itanium_mangler.mangle(what, types, **tags))
 
 
-class _SeparateCompiler(CompilerBase):
-    """Numba's pipeline with `_SeparateLowering` in place of native lowering."""
+class _SeparateCompiler(KernelCompiler):
+    """That of separate kernels."""
 
-    def define_pipelines(self) -> list[Any]:
-        """The one pipeline."""
-        return [replace_pass(self.state, NativeLowering, _SeparateLowering)]
+    lowering = _SeparateLowering
 
 
-class SeparateKernel(CPUDispatcher):
+class SeparateKernel(Kernel):
     """A function that is compiled once, for Python and for all kernels that call it."""
 
+    compiler = _SeparateCompiler
+
     def __init__(self, function: Callable[..., Any], options: Mapping[str, Any]) -> None:
-        own = {**options, "nopython": True, "boundscheck": None}
-        super().__init__(py_func=function, targetoptions=own, pipeline_class=_SeparateCompiler)
+        super().__init__(function, options)
         self._cache = _CACHES[function] = KernelCache(self)
 
     def compile(self, signature: Any) -> Any:

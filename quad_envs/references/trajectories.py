@@ -206,7 +206,9 @@ def _has_equal_steps(t: Array) -> bool:
 
 
 @kernel
-def tabulate_smooth(uniform: Array, choice: Array, t: Array, index: IntArray, out: Array) -> None:
+def tabulate_smooth(
+    uniform: Array, choice: Array, t: Array, index: IntArray, out: Array, work: Array
+) -> None:
     """Tables of random sums of a (sin(w t + phi) - sin(phi)) and their derivatives.
 
     Args:
@@ -216,9 +218,10 @@ def tabulate_smooth(uniform: Array, choice: Array, t: Array, index: IntArray, ou
         t: Times, (n,), s.
         index: Which tables are written, (m,).
         out: All tables, (M, n, >= 8); what is behind the heading is zero.
+        work: Overwritten, (8, n).
     """
-    drawn, paths = uniform.reshape(uniform.shape[0], 3, 3, uniform.shape[1] // 9), np.empty((6, t.size))
-    sine, cosine, equal = np.empty(t.size), np.empty(t.size), _has_equal_steps(t)
+    drawn = uniform.reshape(uniform.shape[0], 3, 3, uniform.shape[1] // 9)
+    paths, sine, cosine, equal = work[:6], work[6], work[7], _has_equal_steps(t)
     for m in range(index.size):
         paths[:] = 0.0
         for axis in range(3):
@@ -291,7 +294,8 @@ class RandomSmooth:
     def tabulate(self, uniform: Array, t: Array, index: IntArray, out: Array) -> None:
         """Write tables of random trajectories; arguments as in `tabulate_smooth`."""
         choice = np.array([*self.amplitude, self.rate_min, self.rate_max])
-        _tabulate_smooth(np.ascontiguousarray(uniform), choice, np.ascontiguousarray(t), index, out)
+        work = np.empty((8, t.size))
+        _tabulate_smooth(np.ascontiguousarray(uniform), choice, np.ascontiguousarray(t), index, out, work)
 
 
 @dataclass(frozen=True, slots=True)

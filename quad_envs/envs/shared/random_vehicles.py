@@ -21,6 +21,7 @@ _NUMBERS = {"mass": slice(0, 1), "inertia": slice(1, 4), "arm": slice(4, 5), "ka
 _NUMBERS |= {"rotor_rate": slice(6, 7), "drag": slice(7, 8)}
 _MASS, _JX, _JY, _JZ, _ARM, _KAPPA, _ROTOR_RATE, _DRAG, _N_VARIED = range(9)
 _GRAVITY, _YAW_MOMENT, _ALONG, _ACROSS = range(4)
+_N_WORK = _N_VARIED + N_COEFFICIENTS + N_INPUT
 
 
 class RandomVehicles(NamedTuple):
@@ -34,7 +35,8 @@ class RandomVehicles(NamedTuple):
 
     def place(self, uniform: Array, index: IntArray, vehicles: Blocks, h: float) -> None:
         """Let vehicles (m,) be those of uniform numbers (m, k) in [0, 1); h is a substep, s."""
-        _place_random(np.ascontiguousarray(uniform), *self, h, index, vehicles.group, vehicles.array)
+        work = np.empty(_N_WORK)
+        _place_random(np.ascontiguousarray(uniform), *self, h, index, vehicles.group, vehicles.array, work)
 
 
 def random_vehicles(task: BaseTask, randomization: Mapping[str, float]) -> RandomVehicles:
@@ -83,6 +85,7 @@ def place_random(
     index: IntArray,
     group: int,
     blocks: Array,
+    work: Array,
 ) -> None:
     """Write vehicles into their blocks; `QuadrotorParams.coefficients` and `varied`, compiled.
 
@@ -97,10 +100,13 @@ def place_random(
         index: Vehicles, (m,).
         group: Vehicles that begin with a block of their own.
         blocks: All blocks.
+        work: Overwritten, (_N_WORK,).
     """
-    v, c, most, each = np.empty(_N_VARIED), np.empty(N_COEFFICIENTS), np.empty(N_INPUT), -(-group // LANES)
+    v, c, most = work[:_N_VARIED], work[_N_VARIED : _N_WORK - N_INPUT], work[_N_WORK - N_INPUT :]
+    each = -(-group // LANES)
     for m in range(index.size):
-        v[:] = nominal
+        for k in range(v.size):
+            v[k] = nominal[k]
         for k in range(columns.size):
             v[columns[k]] *= 1.0 + spreads[k] * (2.0 * uniform[m, k] - 1.0)
         total = v[_JX] + v[_JY] + v[_JZ]
