@@ -41,7 +41,7 @@ def test_environments_are_first_then_the_dearest_mpc_then_what_shares_no_solver_
     entries = [TRACKING_POLICIES[name] for name in policies if name in TRACKING_POLICIES]
     assert first == env_id and {policies[0], policies[1]} <= TRACKING_POLICIES.keys()
     assert [entry.mpc for entry in entries] == [True, *[False] * 5, *[True] * 3]
-    for group in (entries[:1] + entries[6:], entries[1:6]):
+    for group in (entries[:1] + entries[:5:-1], entries[1:6]):
         prices = [entry.decision_ms for entry in group]
         assert prices == sorted(prices, reverse=True)
 

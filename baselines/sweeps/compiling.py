@@ -112,7 +112,8 @@ def _short(unit: Unit) -> Unit:
 def _pieces(units: Sequence[Unit]) -> list[Piece]:
     """Environments first, since whole flights need them; then decisions, the longest first.
 
-    All MPCs share a solver. One of them is next, and the others are last: until then it is compiled.
+    All MPCs share a solver. The longest of them is next, and the others are last: until then it is compiled.
+    Among these the quick ones come first: `score-nmpc` finds the kernel of `nmpc`, once that is there.
     """
     hover = {unit.env.id: unit._replace(policy=PolicyChoice("hover"), policy_name="hover") for unit in units}
     envs = [Piece(unit.env.id, fly_unit, unit) for unit in hover.values()]
@@ -124,7 +125,7 @@ def _pieces(units: Sequence[Unit]) -> list[Piece]:
         policies.setdefault(key, Piece(unit.policy.name, call, unit))
     longest = sorted(policies.values(), key=_decision_ms, reverse=True)
     mpcs = [piece for piece in longest if (entry := registered(piece.unit)) is not None and entry.mpc]
-    return [*envs, *mpcs[:1], *(piece for piece in longest if piece not in mpcs), *mpcs[1:]]
+    return [*envs, *mpcs[:1], *(piece for piece in longest if piece not in mpcs), *mpcs[:0:-1]]
 
 
 def _decision_ms(piece: Piece) -> float:
