@@ -98,6 +98,7 @@ def test_the_time_left_follows_the_work_and_not_the_count():
 
 
 def test_networks_that_are_trained_are_counted_with_the_time_left(tmp_path, capsys):
+    pytest.importorskip("torch", reason="dagger trains with it")
     suite = {
         "name": "learned",
         "episodes": 1,

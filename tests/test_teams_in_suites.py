@@ -133,6 +133,7 @@ def test_teams_change_no_digest_of_the_shipped_protocol_without_them():
 
 
 def test_what_a_training_goes_on_from_is_said_and_counts_in_the_digest():
+    pytest.importorskip("torch", reason="apg trains with it")
     begun = TRAINED | {"train": {"seconds": 1, "start_from": "dagger-formation"}, "name": "apg"}
     suite = suite_from_dict(MIXED | {"policies": [*MIXED["policies"][:-1], begun]})
     (unit,) = [unit for unit in training_units(suite) if unit.policy.name == "apg"]
