@@ -272,7 +272,8 @@ def advance_teams_vjp(
                     record.plants[r], record.commands[r], record.force_max[r], record.coefficients[r],
                     substeps, h, scratch.past[i], scratch.stages,
                 )  # fmt: skip
-                scratch.past[i, substeps] = record.after[r]
+                for k in range(record.after.shape[1]):
+                    scratch.past[i, substeps, k] = record.after[r, k]
         for i in range(n):
             r = first + i
             if record.flew[r] and not record.crashed[r]:
