@@ -1,6 +1,7 @@
 # make demo   install into .venv, fly every tracking baseline on the helix and write a page of it (needs Python and pip)
 # make test   install the development extras and run ruff, mypy and the tests
 # make slow   the tests that take longer: dissertation tables, other solvers, long flights
+# make trust  try to break things for an hour, and say what was tried and what failed
 # make wheel  build a wheel into dist/ whose kernels are compiled: no wait at the first use (x86-64)
 # make sdist  build the source distribution into dist/: packages, tests and documentation
 # make check-release  both; install the wheel into a new environment far from here, and run all quick tests there
@@ -22,7 +23,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 
 EXTRAS := $(shell sed -n '/optional-dependencies/,/^\[project.scripts/s/^\([a-z]*\) = .*/\1/p' pyproject.toml)
 
-.PHONY: demo test slow test-matrix wheel sdist check-release docs extras rllib test-rllib ray clean
+.PHONY: demo test slow trust test-matrix wheel sdist check-release docs extras rllib test-rllib ray clean
 
 demo:
 	@test -e $(VENV)/installed || echo "install: into $(VENV), one to three minutes; then compile, about one, and fly"
@@ -38,6 +39,9 @@ test: $(VENV)/installed-dev
 
 slow: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m slow
+
+trust: $(VENV)/installed-dev
+	$(BIN)/python -m benchmarks.trust --seconds 600
 
 test-matrix:
 	.ci/test-matrix $(TESTS)

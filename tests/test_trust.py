@@ -93,7 +93,7 @@ def test_a_cell_with_a_word_for_a_number_is_refused_by_name(folder, name, value)
         (problems.problems, 60),
         (observations.observations, 50),
         (malformed.malformed, 40),
-        (repeat.repeat, 11),
+        (repeat.repeat, 5),
     ],
 )
 def test_a_little_of_each_figure_fails_nowhere(tries, number):

@@ -218,6 +218,7 @@ def _update_by_fix(
 
 @kernel
 def _is_finite(values: Array) -> bool:
+    """Whether all are finite; without a branch, so that it vectorises."""
     bad = 0
     for value in values:
         bad |= 0 if abs(value) < math.inf else 1
@@ -287,8 +288,7 @@ def filter_row(
         valid: Overwritten, (1 + K,).
         scratch: Overwritten, (filter_scratch,).
     """
-    x, covariance = memory[1:7], memory[7:43].reshape(6, 6)
-    m = measured.shape[0]
+    x, covariance, m = memory[1:7], memory[7:43].reshape(6, 6), measured.shape[0]
     z, place = scratch[: 3 * m].reshape(m, 3), scratch[3 * m : 6 * m].reshape(m, 3)
     age, motion, rest = scratch[6 * m : 7 * m], scratch[7 * m : 7 * m + 6], scratch[7 * m + 6 :]
     _own_motion(plant, disturbance, coefficients, motion)
@@ -308,7 +308,7 @@ def filter_row(
             memory[STAGE] = 2.0
     report[2], report[3] = float(held), 0.0
     _enter(z, place, age, valid, sigma, rows, limits, data, prior, x, covariance, report, rest)
-    if not (_is_finite(x) and _is_finite(memory[7:43])):  # after numbers that no sensor gives
+    if not _is_finite(memory[1:43]):  # after numbers that no sensor gives
         _begin(slot, prior, x, covariance)
         memory[STAGE] = 1.0
         report[0], report[1], report[3] = math.nan, 0.0, 0.0

@@ -54,14 +54,12 @@ def forward_rows(
         weights: Row by row the weights of a layer, then its biases, layer after layer.
         kinds: Whether layers but the last are relu and not tanh; whether the outputs pass a tanh before they
             are clipped to [-1, 1], (2,).
-        gains: Slopes of the actions by the first four outputs, below zero and above, (2, 4), see
-            `quad_envs.encoding.hover_gains`.
+        gains: Slopes of the actions by the first four outputs, below zero and above, `hover_gains`, (2, 4).
         work: Scratch, (2, max(sizes)).
         out: Result, (n, sizes[-1]).
 
     Returns:
-        -1, or the flat index of the first entry of the observations that is not finite, seen or not; or
-        -2 - r where row r is finite, but so large that the network's answer is no number.
+        -1; the flat index of the first entry that is not finite, seen or not; -2 - r if row r has no answer.
     """
     layers = sizes.size - 1
     relu, tanh_last = kinds[0], kinds[1]
