@@ -108,7 +108,7 @@ def test_the_table_says_what_was_tried_and_what_failed(monkeypatch):
     printed = table([one, Outcome("kills", 3, 1, 0.0, 2.0, ("benchmark: differs",))])
     assert "100000 problems" in printed and printed.splitlines()[-1].split()[-4:] == ["3", "1", "-", "2"]
     assert set(FIGURES) == {
-        *("soak", "problems", "observations", "inputs", "kills", "malformed", "repeat"),
+        *("soak", "problems", "observations", "inputs", "kills", "malformed", "repeat", "rows"),
     }
 
 

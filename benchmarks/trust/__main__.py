@@ -22,7 +22,7 @@ from .kills import kills
 from .malformed import malformed
 from .observations import fliers, observations
 from .problems import problems
-from .repeat import repeat
+from .repeat import repeat, rows
 from .soak import soak
 
 FIGURES = {
@@ -35,6 +35,7 @@ FIGURES = {
     "kills": Figure("commands killed and called again", 100, "kills", kills),
     "malformed": Figure("malformed files, hostile names", 200, "files", malformed),
     "repeat": Figure("same seed, same bits", 1000, "comparisons", repeat),
+    "rows": Figure("networks among more flights and among fewer", 20, "comparisons", rows),
 }
 SECONDS = 60.0
 _KEPT = 20  # failures of a figure that are said

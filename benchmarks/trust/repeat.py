@@ -25,7 +25,7 @@ from .found import Found, tried
 
 _STEPS = 60
 _CONTROLLERS = ("random", "hover", "lqr", "lmpc", "sdc-nmpc", "nmpc", "sdre", "feedback-linearization")
-_POLICIES = (*_CONTROLLERS, "apg-helix", "ppo-helix")
+_NETWORKS = ("apg-helix", "dagger-helix", "ppo-helix", "apg-generalist")
 
 
 def repeat(seed: int) -> Iterator[Found]:
@@ -120,14 +120,12 @@ def _single_is_vector(rng: random.Random) -> str:
     return ""
 
 
-def _suite(rng: random.Random, episodes: int, policies: tuple[str, ...] = _POLICIES) -> dict[str, Any]:
+def _suite(
+    rng: random.Random, episodes: int, policies: tuple[str, ...] = (*_CONTROLLERS, *_NETWORKS)
+) -> dict[str, Any]:
     envs = [{"id": env_id, "kwargs": {"time_limit": 1.0}} for env_id in rng.sample(list(TRACKING), 2)]
-    return {
-        "envs": envs,
-        "policies": rng.sample(_POLICIES, 3),
-        "episodes": episodes,
-        "seed": rng.randrange(1000),
-    }
+    chosen = rng.sample(policies, 3)
+    return {"envs": envs, "policies": chosen, "episodes": episodes, "seed": rng.randrange(1000)}
 
 
 def _flown(suite: dict[str, Any], jobs: int = 1) -> list[str]:
@@ -149,12 +147,20 @@ def _jobs(rng: random.Random) -> str:
     return "" if _flown(suite) == _flown(suite, jobs=2) else f"{suite}: differs with two processes"
 
 
-def _blocks(rng: random.Random) -> str:
-    """A flight beside others, and among fewer; a network's matrix products round by the number of rows."""
-    suite = _suite(rng, 6, _CONTROLLERS)
+def _blocks(rng: random.Random, policies: tuple[str, ...] = _CONTROLLERS) -> str:
+    """A flight beside others, and among fewer."""
+    suite = _suite(rng, 6, policies)
     many = [json.loads(one)[1][:2] for one in _flown(suite)]
     few = [json.loads(one)[1] for one in _flown({**suite, "episodes": 2})]
     return "" if repr(many) == repr(few) else f"{suite}: a flight depends on those beside it"
+
+
+def rows(seed: int) -> Iterator[Found]:
+    """Flights of networks among 6 and among 2, without end: matrix products round by the number of rows."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for k in count():
+            yield tried("networks beside others", partial(_blocks, random.Random(f"{seed} {k}"), _NETWORKS))
 
 
 def digest(seed: int) -> str:
