@@ -113,7 +113,9 @@ def test_a_record_of_a_team_has_the_tail_of_its_own_error():
     }
     base = dict.fromkeys(read_record.__globals__["Record"]._fields, 0.1)
     team = [
-        read_record({**base, "seed": seed, "agent": name, "crashed": False, "worst_violation": {}})
+        read_record(
+            {**base, "seed": seed, "agent": name, "crashed": False, "crash_cause": "", "worst_violation": {}}
+        )
         for seed in range(TAILS_LEAST)
         for name in ("drone_0", "drone_1")
     ]
