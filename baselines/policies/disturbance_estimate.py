@@ -75,7 +75,9 @@ def append_estimates(
         decode_own(obs[j], plant, command)
         if start[j]:
             kept[:] = 0.0
-        kept[_COMMAND] = command
+        before = kept[_COMMAND]
+        for i in range(N_INPUT):
+            before[i] = command[i]
         update_estimate(plant, kept, gain, c, dt, force_max, estimate, work)
         for i in range(N_DISTURBANCE):
             revealed[i] = obs[j, revealed_at + i] if revealed_at >= 0 else 0.0

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 
 import quad_envs  # noqa: F401  registers the ids
-from quad_envs.names import unknown_name
+from quad_envs.names import shown, unknown_name
 from quad_envs.registration import TEAMS, TRACKING
 from quad_envs.tasks import BaseTask
 
@@ -111,7 +111,7 @@ def require_own_task(env: Any) -> None:
 
 def _no_task(source: Any) -> ValueError:
     return ValueError(
-        f"cannot find the task of {source!r}: give an environment of this suite (gymnasium.make, "
+        f"cannot find the task of {shown(source)}: give an environment of this suite (gymnasium.make, "
         f"make_vec, pettingzoo.make), one of the ids {', '.join([*TRACKING, *TEAMS])}, or a quad_envs.Task"
     )
 
