@@ -159,6 +159,19 @@ def test_every_cell_of_the_notebook_runs_and_no_output_is_stored(monkeypatch):
     assert costs["nmpc"] == 0.0 < costs["ppo-corridor"]  # as the text says
 
 
+def test_the_pages_of_the_protocol_are_what_its_published_numbers_say():
+    made = script("protocol")
+    assert made.PAGE.read_text(encoding="utf-8") == made.renewed(), "run: python docs/protocol.py"
+    for label in ("as derived", "levelled"):
+        assert any(row["table"] == label and row["base"] for row in made.published())
+
+
+def test_only_results_of_a_protocol_are_published(tmp_path):
+    (tmp_path / "config.json").write_text('{"suite": {}}')
+    with pytest.raises(ValueError, match="holds no results of a protocol"):
+        script("protocol").publish(tmp_path)
+
+
 def test_every_page_is_in_the_navigation_and_every_entry_of_it_is_a_page():
     listed = re.findall(r": (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
     assert sorted(listed) == sorted(page.relative_to(ROOT / "docs").as_posix() for page in PAGES[1:])
