@@ -158,8 +158,10 @@ def gust_numbers(nodes: int) -> int:
 @kernel
 def _tabulate_gusts(key: int, keep: float, size: Array, drawn: Array, out: Array) -> None:
     """Gusts of all periods, (steps, nodes, 6)."""
+    last = out.shape[1] - 1
     for k in range(out.shape[0]):
-        out[k] = out[max(k - 1, 0)]
+        for c in range(6):
+            out[k, last, c] = out[max(k - 1, 0), last, c]
         blow(out[k], key, k, keep, size, drawn)
 
 
