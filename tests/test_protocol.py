@@ -288,6 +288,13 @@ def test_only_keeps_the_parts_that_are_named():
         load_suite(SMALL).only(["leveled"])
 
 
+def test_only_a_condition_keeps_the_environments_that_meet_it():
+    whole = load_suite("quad-bench-2026.1")
+    gusts = whole.only(["gusts"])
+    assert [env.title for env in gusts.envs] == [e.title for e in whole.envs if "gusts" in whole.flown(e)]
+    assert len(gusts.envs) < len(whole.envs)
+
+
 def test_a_stored_protocol_is_read_again_and_one_of_before_had_no_tables():
     suite = load_suite(SMALL)
     stored = json.loads(json.dumps(suite.to_dict()))
