@@ -20,12 +20,16 @@ FRAMES = ["plus", "x"]
 
 @kernel
 def _derivative(x, F, d, c, out):
-    out[:] = np.array(rigid_body(x, F, d, c))
+    rates = rigid_body(x, F, d, c)
+    for i in range(12):
+        out[i] = rates[i]
 
 
 @kernel
 def _shares(alpha, c, out):
-    out[:] = np.array(rotor_shares(alpha[0], alpha[1], alpha[2], c))
+    shares = rotor_shares(alpha[0], alpha[1], alpha[2], c)
+    for i in range(4):
+        out[i] = shares[i]
 
 
 @pytest.mark.parametrize("frame", FRAMES)

@@ -27,7 +27,9 @@ ANCHOR_F = np.array([2.5, 1.5, 2.2, 1.8])
 
 @kernel
 def _derivative(x, F, d, c, out):
-    out[:] = np.array(rigid_body(x, F, d, c))
+    rates = rigid_body(x, F, d, c)
+    for i in range(12):
+        out[i] = rates[i]
 
 
 @kernel

@@ -223,7 +223,7 @@ def test_every_kind_with_defaults_is_made_by_its_name():
         (lambda: make_reference([10**400] * 3), "2 or more rows of 3 to 8 columns"),
         (lambda: make_disturbance([10**400] * 3), "a force of 3 finite numbers"),
         (lambda: make_graph([[10**400] * 4] * 4, None, 4), "a graph is a name"),
-        (lambda: make_kind("graph", {"kind": "timed", "graphs": ["star"], "times": 3}, KINDS), "made of"),
+        (lambda: make_kind("graph", {"kind": "timed", "graphs": ["star"], "times": 3}, KINDS), "got 3"),
         (lambda: make_reference("heading"), "the reference 'heading' needs reference"),
         (lambda: make_reference({"kind": 3}), "unknown kind of reference 3"),
         (lambda: make_reference({"radius": 3}), "the header must name t, x, y, z"),
