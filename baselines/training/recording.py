@@ -132,8 +132,10 @@ def record(
     """
     _require_minari()
     if not isinstance(env, gymnasium.Env) or env.spec is None:
+        got = getattr(getattr(env, "unwrapped", None), "task", None)
+        given = shown(env) if got is None else f"{got.env_id}, {type(env).__name__}"
         raise ValueError(
-            f"Minari's datasets are of a single Gymnasium environment, got {shown(env)}; flights of a team "
+            f"Minari's datasets are of a single Gymnasium environment, got {given}; flights of a team "
             "are kept by quad-envs evaluate --out FOLDER --save-episodes"
         )
     pilots = _pilots(policies, env, noise)
