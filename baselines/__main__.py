@@ -28,7 +28,7 @@ from .cli.options import (
     read_options,
     refuse_unknown,
 )
-from .cli.streams import quiet_pipe, take_streams
+from .cli.streams import give_up_output, quiet_pipe, take_streams
 from .errors import MissingPackageError
 from .interruptions import exit_code, remembered
 
@@ -173,6 +173,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except BrokenPipeError:
             raise
         except Exception as error:
+            give_up_output()
             if os.environ.get("QUAD_ENVS_TRACEBACK") or not isinstance(error, _input_errors()):
                 raise
             print(f"quad-envs: error: {_one_line(error)}", file=sys.stderr)

@@ -135,17 +135,21 @@ def test_values_of_any_kind_on_the_command_line_are_refused_by_name(capsys, valu
         ("list >&-", 2, 1),
         ("--help >&-", 2, 1),
         ("list > /dev/full", 2, 1),
+        ("list --json > /dev/full", 2, 1),
         ("evaluate quad/HelixTracking-v0 hovr 2>&-", 2, 0),
         ("evaluate quad/HelixTracking-v0 hovr >&- 2>&-", 2, 0),
         ("list <&- > /dev/null", 0, 0),
     ],
 )
-def test_closed_streams_end_with_one_line_and_print_nowhere_else(tmp_path, redirection, code, errors):
+@pytest.mark.parametrize("unbuffered", ["1", ""])
+def test_closed_streams_end_with_one_line_and_print_nowhere_else(
+    tmp_path, redirection, code, errors, unbuffered
+):
     done = subprocess.run(
         ["bash", "-c", f"{RUN} {redirection}"],
         capture_output=True,
         text=True,
-        env={**os.environ, "COLUMNS": "80"},
+        env={**os.environ, "COLUMNS": "80", "PYTHONUNBUFFERED": unbuffered},
     )
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (code, "", errors)
     assert "Traceback" not in done.stderr

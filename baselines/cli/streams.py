@@ -31,9 +31,19 @@ def _onto_null(number: int) -> None:
         os.close(null)
 
 
+def give_up_output() -> None:
+    """Forget what is printed and cannot be written, as on a full disk, so that nothing tries it again."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except OSError:
+        _onto_null(sys.stdout.fileno())
+
+
 @contextmanager
 def quiet_pipe() -> Iterator[None]:
-    """End without a word when the reader of a pipe, as `head`, has gone."""
+    """End without a word when the reader of a pipe, as `head`, has gone; with one where a disk is full."""
     try:
         try:
             yield
@@ -42,3 +52,9 @@ def quiet_pipe() -> Iterator[None]:
     except BrokenPipeError:
         _onto_null(sys.stdout.fileno())
         raise SystemExit(BROKEN_PIPE) from None
+    except OSError as error:
+        if os.environ.get("QUAD_ENVS_TRACEBACK"):
+            raise
+        _onto_null(sys.stdout.fileno())
+        print(f"quad-envs: error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
