@@ -11,7 +11,7 @@ from baselines import evaluate
 from baselines.evaluation.amounts import INTERVAL_LEAST
 from baselines.evaluation.metrics import estimate
 from baselines.evaluation.statistics import compare, difference, mean_interval
-from baselines.report.answer import answer, rounded
+from baselines.report.answer import answer, percent, rounded
 from baselines.sweeps.contenders import Contender
 
 
@@ -154,3 +154,7 @@ def test_the_difference_alone_is_the_one_of_the_comparison():
     assert (one.low, one.high) == pytest.approx((other.low, other.high), abs=0.02)
     own = mean_interval(x)
     assert own.low < own.value < own.high and math.isnan(mean_interval(np.full((1, 9), np.nan)).low)
+
+
+def test_a_share_next_to_nothing_is_said_in_words():
+    assert [percent(share) for share in (0.0, 4e-5, 0.0123)] == ["0 %", "less than 0.01 %", "1.2 %"]

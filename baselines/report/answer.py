@@ -19,6 +19,7 @@ from .model import Answer
 
 _RESAMPLES = 500  # of intervals in sentences
 _NO_MORE = 1e-4  # half width over the mean, below which the interval is not worth its digits
+_LEAST_SHARE = 1e-4
 _MOST_NAMED = 4  # policies in a list
 
 
@@ -83,7 +84,9 @@ def _paired(one: Contender, other: Contender) -> tuple[Array, Array]:
 
 
 def percent(share: float) -> str:
-    """A share with two digits."""
+    """A share with two digits; one that is next to nothing in words."""
+    if 0.0 < share < _LEAST_SHARE:
+        return f"less than {100.0 * _LEAST_SHARE:g} %"
     return f"{format_number(100.0 * share, 2)} %"
 
 
