@@ -36,7 +36,6 @@ from typing import Any
 import numpy as np
 
 import quad_envs
-from quad_envs.names import shown
 
 from .errors import ResultsError
 
@@ -59,38 +58,6 @@ _RESULTS = (
 RESULTS_FORMAT = 3  # of the folder; 2 had one cell per unit, 1 neither this number nor tasks in cells
 _SOURCES = (".py", ".toml", ".json", ".safetensors")
 _DISTRIBUTIONS = ("gymnasium", "pettingzoo", "numpy", "scipy", "numba", "osqp", "joblib")
-
-
-def require_path(what: str, value: Any) -> None:
-    """Check that a value is a path, as text or an object.
-
-    Raises:
-        ValueError: If it is not.
-    """
-    if not isinstance(value, str | os.PathLike):
-        raise ValueError(f"{what} must be a path, got {shown(value)}")
-
-
-def require_words(**given: Any) -> None:
-    """Check that arguments are texts.
-
-    Raises:
-        ValueError: If one is not; it names the argument.
-    """
-    for name, value in given.items():
-        if not isinstance(value, str):
-            raise ValueError(f"{name} must be a text, got {shown(value)}")
-
-
-def require_mappings(**given: Any) -> None:
-    """Check that arguments are mappings or None.
-
-    Raises:
-        ValueError: If one is neither; it names the argument.
-    """
-    for name, value in given.items():
-        if not isinstance(value, Mapping | None):
-            raise ValueError(f"{name} must be a mapping of names to values, got {shown(value)}")
 
 
 def write_atomic(path: Path, data: bytes) -> None:

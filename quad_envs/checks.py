@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, get_args
 
 from .kinds import is_number, is_whole
@@ -80,6 +80,49 @@ def require_whole(
         allowed = f"from {least} to {most}"
         taken = f", which would take about {memory_text(memory(int(value)))}" if memory else ""
     raise ValueError(f"{what} must be a whole number {allowed}, got {shown(value)}{taken}")
+
+
+def require_path(what: str, value: Any) -> None:
+    """Check that a value is a path, as text or an object.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    if not isinstance(value, str | os.PathLike):
+        raise ValueError(f"{what} must be a path, got {shown(value)}")
+
+
+def require_paths(**given: Any) -> None:
+    """Check that arguments are paths or None.
+
+    Raises:
+        ValueError: If one is neither; it names the argument.
+    """
+    for name, value in given.items():
+        if value is not None:
+            require_path(name, value)
+
+
+def require_words(**given: Any) -> None:
+    """Check that arguments are texts.
+
+    Raises:
+        ValueError: If one is not; it names the argument.
+    """
+    for name, value in given.items():
+        if not isinstance(value, str):
+            raise ValueError(f"{name} must be a text, got {shown(value)}")
+
+
+def require_mappings(**given: Any) -> None:
+    """Check that arguments are mappings or None.
+
+    Raises:
+        ValueError: If one is neither; it names the argument.
+    """
+    for name, value in given.items():
+        if not isinstance(value, Mapping | None):
+            raise ValueError(f"{name} must be a mapping of names to values, got {shown(value)}")
 
 
 def require_memory(what: str, size: float, remedy: str) -> None:

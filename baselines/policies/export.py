@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quad_envs.checks import require_path
 from quad_envs.encoding import Encoder
 from quad_envs.observations.features import Features, entry_names
 from quad_envs.tasks import TeamTask
 
 from ..errors import CheckpointError
-from ..files import require_path
 from .checkpoints import DESCRIPTION, save_checkpoint
 from .disturbance_estimate import sees_estimate, with_estimate
 from .environments import find_task, task_of

@@ -10,10 +10,10 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from quad_envs.checks import require_path
 from quad_envs.names import shown, unknown_name
 
 from ..errors import CheckpointError
-from ..files import require_path
 
 if TYPE_CHECKING:  # not at run time: tasks load numba, and `quad-envs list` has to be quick
     from quad_envs.tasks import TeamTask

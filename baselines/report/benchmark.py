@@ -11,12 +11,13 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from quad_envs.checks import require_paths
 from quad_envs.field_comments import called_with
 from quad_envs.names import shown
 
 from ..errors import ResultsError
 from ..evaluation.amounts import require_jobs
-from ..files import locked, require_path, write_atomic
+from ..files import locked, write_atomic
 from ..policies.environments import make_env
 from ..policies.outside import name_of
 from ..policies.registry import behind_filter, from_outside, is_trained, make_policy, policy_entry
@@ -65,9 +66,7 @@ def run_benchmark(request: BenchmarkRequest) -> Results:
         PolicyError: If everything that was to be flown broke off.
         ResultsError: If the folder is in use, holds another suite, or cannot be written.
     """
-    for what in ("out", "networks"):
-        if getattr(request, what) is not None:
-            require_path(what, getattr(request, what))
+    require_paths(out=request.out, networks=request.networks)
     if not isinstance(request.policies, Mapping | None):
         raise ValueError(f"policies must be a mapping of labels, got {shown(request.policies)}")
     suite, given = _with_policies(load_suite(request.suite), request.policies or {})

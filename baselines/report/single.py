@@ -7,12 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from quad_envs.checks import require_path
 from quad_envs.names import shown
 from quad_envs.tasks import BaseTask, TeamTask
 
 from ..evaluation.episode import Episode
 from ..evaluation.evaluate import Evaluation, fly_and_measure
-from ..files import plain_json, require_path
+from ..files import plain_json
 from ..policies.environments import require_own_task
 from ..policies.outside import name_of
 from ..policies.protocol import Policy

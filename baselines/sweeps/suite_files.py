@@ -44,10 +44,10 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
 
+from quad_envs.checks import require_path
 from quad_envs.names import shown, unknown_name
 from quad_envs.registration import TEAMS, TRACKING
 
-from ..files import require_path
 from ..policies.registry import TEAM_POLICIES, TRACKING_POLICIES, behind_filter, from_outside
 from ..policies.trained import names_trained
 from ..training.algorithms import ALGORITHMS

@@ -9,7 +9,8 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
 
-from ..files import require_mappings, require_path, require_words
+from quad_envs.checks import require_mappings, require_paths, require_words
+
 from .watching import Watcher
 
 
@@ -44,9 +45,7 @@ class TrainingRequest:
     def __post_init__(self) -> None:
         require_words(env_id=self.env_id, algorithm=self.algorithm)
         require_mappings(env_kwargs=self.env_kwargs, hyper=self.hyper)
-        for what in ("out", "start_from"):
-            if getattr(self, what) is not None:
-                require_path(what, getattr(self, what))
+        require_paths(out=self.out, start_from=self.start_from)
         if self.resume and self.fresh:
             raise ValueError("either resume or fresh: a run that is discarded cannot go on")
 

@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from quad_envs.checks import require_choice, require_whole
+from quad_envs.checks import require_choice, require_mappings, require_paths, require_whole, require_words
 from quad_envs.field_comments import called_with
 from quad_envs.kinds import is_number
 from quad_envs.names import shown
@@ -34,9 +34,6 @@ from ..files import (
     plain_json,
     provenance,
     read_json,
-    require_mappings,
-    require_path,
-    require_words,
     write_csv,
     write_json,
 )
@@ -83,8 +80,7 @@ class TuningRequest:
     def __post_init__(self) -> None:
         require_words(env_id=self.env_id, policy=self.policy)
         require_mappings(env_kwargs=self.env_kwargs, options=self.options)
-        if self.out is not None:
-            require_path("out", self.out)
+        require_paths(out=self.out)
         require_choice("objective", self.objective, Objective)
         require_whole("seed of a tuning", self.seed, 0, 99)
         if self.resume and self.fresh:
