@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from controllers.controller import all_finite
 from controllers.estimation.ekf_kernels import NIS_LIMIT, ekf_scratch, ekf_update_kernel, predict_kernel
 from controllers.estimation.kalman import kalman_scratch, kalman_update_kernel
 from controllers.estimation.restart_kernels import begin_anew, move_to_lines
@@ -217,15 +218,6 @@ def _update_by_fix(
 
 
 @kernel
-def _is_finite(values: Array) -> bool:
-    """Whether all are finite; without a branch, so that it vectorises."""
-    bad = 0
-    for value in values:
-        bad |= 0 if abs(value) < math.inf else 1
-    return bad == 0
-
-
-@kernel
 def _enter(
     z: Array,
     place: Array,
@@ -308,7 +300,7 @@ def filter_row(
             memory[STAGE] = 2.0
     report[2], report[3] = float(held), 0.0
     _enter(z, place, age, valid, sigma, rows, limits, data, prior, x, covariance, report, rest)
-    if not _is_finite(memory[1:43]):  # after numbers that no sensor gives
+    if not all_finite(memory[1:43]):  # after numbers that no sensor gives
         _begin(slot, prior, x, covariance)
         memory[STAGE] = 1.0
         report[0], report[1], report[3] = math.nan, 0.0, 0.0
