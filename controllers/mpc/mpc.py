@@ -191,8 +191,9 @@ class Mpc(ABC):
             # A plan that flies to its limits has to know how late the rotors are, and so has a linear model,
             # which makes up for no other error by iterating.
             self._data = self._data._replace(lag=1.0 / task.params.rotor_rate)
-        many_pairs = many_pairs or (weighs and len(self._data.R_rate) > 0)  # as R_rate beside an R of each
-        self._pairs = self.horizon if many_pairs else 1
+        spread = weighs and len(self._data.R_rate) > 0  # as R_rate beside an R of each stage
+        self._first_pairs = self.horizon if spread else 1  # of a first pass on one model
+        self._pairs = self.horizon if many_pairs else self._first_pairs
         self._guess_stages = self.horizon if guess or weighs else 0
         self._keep_from = (
             1 + MEMORY_STAGE * self.horizon + (ESTIMATOR_SIZE if options.reject_disturbance else 0)

@@ -143,6 +143,7 @@ class _Call(NamedTuple):
     relinearisations: int  # passes after the first one, at most
     at_need: bool  # whether a further pass is made only where the plan needs it
     sdre_weight: bool  # whether the terminal weight is that of the present pair
+    first: int  # pairs of the first pass
     floor: float  # of the stage weights, see `score.weigh_stages`
     data: MpcData
     s: Scratch
@@ -166,12 +167,11 @@ def _decide_rows(
     words: IntArray,
 ) -> int:
     """One decision per row; -1, or the code of the first argument that is not finite."""
-    alpha, present, relinearisations, at_need, sdre_weight, floor, data, s, ws = _unpack(words)
+    alpha, present, relinearisations, at_need, sdre_weight, first, floor, data, s, ws = _unpack(words)
     N = ws.u.shape[0]
     bad = first_non_finite(plants, windows, lasts, disturbances, memories, N + 1)
     if bad >= 0:
         return bad
-    first = N if floor < COST_FLOOR and data.R_rate.shape[0] > 0 else 1  # pairs of the first pass
     for j in range(plants.shape[0]):
         begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
         worst, iterations, pairs = 0, 0, first
@@ -227,23 +227,31 @@ class SdcNmpc(Mpc):
         self._present = self._data.present
         self._at_need = options.at_need
         self._sdre_weight = options.terminal_weight == "sdre"
-        self._first = self.horizon if self._floor < COST_FLOOR and len(self._data.R_rate) > 0 else 1
         self._refused, self._stationary, self._posed, self._taken = False, False, 1, 0  # see `_pose`
 
     def _call(self, s: Scratch, ws: Workspace) -> _Call:
-        passes = self.relinearisations, self._at_need
-        weights = self._sdre_weight, self._floor
-        return _Call(self.alpha, self._present, *passes, *weights, self._data, s, ws)
+        return _Call(
+            self.alpha,
+            self._present,
+            self.relinearisations,
+            self._at_need,
+            sdre_weight=self._sdre_weight,
+            first=self._first_pairs,
+            floor=self._floor,
+            data=self._data,
+            s=s,
+            ws=ws,
+        )
 
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
         data = self._data
         if number == 0:
             self._taken = 0  # passes whose plan was taken
             stationary = freeze_model(self.alpha, self._present, self._sdre_weight, data, s)
-            self._stationary = stationary and self._first == 1
-            spread_pair(self._first, s)
+            self._stationary = stationary and self._first_pairs == 1
+            spread_pair(self._first_pairs, s)
             begin_guess(self._floor, memory, s)
-            self._posed = self._first
+            self._posed = self._first_pairs
         elif not self._refused:
             relinearise(ws.u, self.alpha, self._present, data, s)
             guess_plan(self._floor, ws.u, s)
