@@ -16,6 +16,7 @@ import re
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 from baselines.files import write_atomic
@@ -110,6 +111,10 @@ def _plain(name: str, said: str) -> Callable[[dict[str, str]], str]:
     return cell
 
 
+def _policy(row: dict[str, str]) -> str:
+    return f"`{row['policy']}`"
+
+
 def _minus(row: dict[str, str]) -> str:
     return "" if row["policy"] == row["base"] else _spread("score_minus_base")(row)
 
@@ -119,7 +124,7 @@ def _crashes(row: dict[str, str]) -> str:
 
 
 _NUMBERS: dict[str, Callable[[dict[str, str]], str]] = {
-    "policy": lambda row: f"`{row['policy']}`",
+    "policy": _policy,
     "score": _spread("score"),
     "minus the best MPC": _minus,
     "quadratic cost": _spread("quadratic_cost"),
@@ -147,26 +152,24 @@ def _conditions(rows: Rows) -> str:
     found = list(dict.fromkeys(row["condition"] for row in rows))
     if len(found) < 2:
         return ""
+    flown = {(row["policy"], row["condition"]): row for row in rows}
     best = {name: min(_rank(row) for row in rows if row["condition"] == name) for name in found}
 
-    def cell(condition: str) -> Callable[[dict[str, str]], str]:
-        def said(of: dict[str, str]) -> str:
-            row = next((r for r in rows if (r["policy"], r["condition"]) == (of["policy"], condition)), None)
-            if row is None:
-                return ""
-            score = f"{_number(row, 'score'):.3f}"
-            notes = [f"{_crashes(row)} crash"] * (_number(row, "crashed") > 0.0)
-            notes += [f"{percent(_number(row, 'violation_share'))} violating"] * (
-                _number(row, "violation_share") > 0.01
-            )
-            score = f"**{score}**" if _rank(row) == best[condition] else score
-            return f"{score} ({', '.join(notes)})" if notes else score
-
-        return said
+    def cell(condition: str, of: dict[str, str]) -> str:
+        row = flown.get((of["policy"], condition))
+        return "" if row is None else _score(row, _rank(row) == best[condition])
 
     plain = sorted((row for row in rows if row["condition"] == NOMINAL), key=_rank)
-    columns = {"score": lambda row: f"`{row['policy']}`"} | {name: cell(name) for name in found}
-    return _markdown(columns, plain)
+    return _markdown({"score": _policy} | {name: partial(cell, name) for name in found}, plain)
+
+
+def _score(row: dict[str, str], best: bool) -> str:
+    """A score, in bold if it is the best, with the crashes and violations there were."""
+    score, violating = f"{_number(row, 'score'):.3f}", _number(row, "violation_share")
+    notes = [f"{_crashes(row)} crash"] * (_number(row, "crashed") > 0.0)
+    notes += [f"{percent(violating)} violating"] * (violating > 0.01)
+    score = f"**{score}**" if best else score
+    return f"{score} ({', '.join(notes)})" if notes else score
 
 
 def renewed() -> str:

@@ -186,11 +186,10 @@ class Suite:
                 raise ValueError(f"suite {self.name!r} has no part {name!r} yet; it has {', '.join(known)}")
             if name not in known:
                 raise ValueError(unknown_name(f"part of suite {self.name!r}:", name, known))
-        envs = _those(self.envs, lambda env: bool({env.part, env.title, env.id} & set(asked)))
         conditions = _those(self.conditions, lambda one: one.label in asked)
-        if not any({env.part, env.title, env.id} & set(asked) for env in self.envs):  # those that meet one
-            met = [env for env in envs if any(is_for(one.envs, env) for one in conditions)]
-            envs = met if conditions else envs
+        envs = [env for env in self.envs if {env.part, env.title, env.id} & set(asked)]
+        if not envs:
+            envs = _those(self.envs, lambda env: any(is_for(one.envs, env) for one in conditions))
         tables = _those(self.tables, lambda one: one.label in asked)
         labels = {one.label for one in tables}
         policies = [one for one in self.policies if not one.tables or set(one.tables) & labels]

@@ -131,13 +131,7 @@ def record(
             vehicles or a vector, or holds what JSON cannot, or as `run_episodes` says.
     """
     _require_minari()
-    if not isinstance(env, gymnasium.Env) or env.spec is None:
-        got = getattr(getattr(env, "unwrapped", None), "task", None)
-        given = shown(env) if got is None else f"{got.env_id}, {type(env).__name__}"
-        raise ValueError(
-            f"Minari's datasets are of a single Gymnasium environment, got {given}; flights of a team "
-            "are kept by quad-envs evaluate --out FOLDER --save-episodes"
-        )
+    _require_single(env)
     pilots = _pilots(policies, env, noise)
     for pilot in pilots:
         check_flights(pilot.policy, env, episodes, seed, False)
@@ -164,6 +158,18 @@ def record(
         steps = int(storage.total_steps)
     score, cost = np.mean(sums, axis=0).tolist()
     return Recorded(dataset, _folder(dataset), count, steps, score, cost)
+
+
+def _require_single(env: Any) -> None:
+    """Raises ValueError if it is no single environment of Gymnasium."""
+    if isinstance(env, gymnasium.Env) and env.spec is not None:
+        return
+    task = getattr(getattr(env, "unwrapped", None), "task", None)
+    given = shown(env) if task is None else f"{task.env_id}, {type(env).__name__}"
+    raise ValueError(
+        f"Minari's datasets are of a single Gymnasium environment, got {given}; flights of a team "
+        "are kept by quad-envs evaluate --out FOLDER --save-episodes"
+    )
 
 
 def _pilots(policies: Source | Sequence[Source], env: Any, noise: float | Sequence[float]) -> list[_Pilot]:
