@@ -55,6 +55,22 @@ def test_a_number_is_the_gain_of_every_channel():
         LinearMPC(Task(), estimator_gain=2)
 
 
+def test_a_scale_multiplies_the_gain_that_follows_the_noise_up_to_one():
+    task = Task(sensor_noise=(0.0, 0.01, 0.01, 0.01))
+    auto = estimator_gains(task)
+
+    def gain(task, **options):
+        return LinearMPC(task, reject_disturbance=True, **options)._data.gain
+
+    np.testing.assert_allclose(gain(task, estimator_gain_scale=1.5), 1.5 * auto)
+    np.testing.assert_array_equal(gain(Task(), estimator_gain_scale=10.0), 1.0)
+    for scale in (0.0, -1.0, np.inf, np.nan):
+        with pytest.raises(ValueError, match="estimator_gain_scale must be a finite number > 0"):
+            LinearMPC(task, estimator_gain_scale=scale)
+    with pytest.raises(ValueError, match="give the product as estimator_gain"):
+        LinearMPC(task, estimator_gain=0.3, estimator_gain_scale=2.0)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["lmpc", "sdc-nmpc", "nmpc"])
 def test_under_sensor_noise_the_estimator_costs_little_and_keeps_what_it_gains_in_gusts(name):

@@ -106,7 +106,9 @@ def test_what_is_tuned_follows_from_the_options_and_the_task():
     assert make_search("nmpc", helix, {}).names == ("Q", "R", "R_rate", "terminal")
     assert make_search("nmpc", corridor, {}).names == ("Q", "R", "R_rate", "terminal", "margin")
     assert make_search("score-nmpc", helix, {}).names[-1] == "floor"
-    assert make_search("sdc-nmpc", helix, {"reject_disturbance": True}).names[-1] == "estimator_gain"
+    rejects = {"reject_disturbance": True}
+    assert make_search("sdc-nmpc", helix, rejects).names[-1] == "estimator_gain_scale"
+    assert make_search("sdc-nmpc", helix, {**rejects, "estimator_gain": 0.3}).names[-1] == "estimator_gain"
     assert make_search("nmpc", helix, {}, ["horizon"]).options(np.array([-1.0])) == {"horizon": 2}
 
 

@@ -57,6 +57,15 @@ def _change_weight(z: Array, task: AnyTask, default: Any) -> float:
     return float(10.0 ** (z[0] - 2.0) if default is None else default * 10.0 ** z[0])
 
 
+def _follows_noise(task: AnyTask, options: Mapping[str, Any]) -> bool:
+    """Whether a disturbance estimator takes its gain from the noise of the sensors."""
+    return bool(options["reject_disturbance"]) and options["estimator_gain"] == "auto"
+
+
+def _own_gain(task: AnyTask, options: Mapping[str, Any]) -> bool:
+    return bool(options["reject_disturbance"]) and options["estimator_gain"] != "auto"
+
+
 def _samples(z: Array, task: AnyTask, default: Any) -> int:
     return int(np.clip(round(default * 10.0 ** z[0]), 1, max(1, task.layout.preview)))
 
@@ -68,7 +77,9 @@ KNOBS: dict[str, Knob] = {
     "R_rate": Knob(1, _change_weight),
     "terminal": Knob(1, _positive),
     "margin": Knob(1, _positive, lambda task, options: len(task.constraint_names) > 0),
-    "estimator_gain": Knob(1, _share, lambda task, options: options["reject_disturbance"]),
+    # The gain itself where the caller gives a number; one that follows the noise of the sensors goes on to.
+    "estimator_gain": Knob(1, _share, _own_gain),
+    "estimator_gain_scale": Knob(1, _positive, _follows_noise),
     "floor": Knob(1, _floor, lambda task, options: options["objective"] == "score"),
     "horizon": Knob(1, _samples, lambda task, options: False),
 }

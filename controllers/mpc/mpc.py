@@ -115,7 +115,7 @@ def estimator_gain(task: BaseTask, options: MpcOptions) -> Array:
     if not options.reject_disturbance:
         return np.zeros(N_DISTURBANCE)
     if options.estimator_gain == "auto":
-        return estimator_gains(task)
+        return np.minimum(1.0, options.estimator_gain_scale * estimator_gains(task))
     return np.full(N_DISTURBANCE, float(options.estimator_gain))
 
 

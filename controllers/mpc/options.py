@@ -115,6 +115,7 @@ class VehicleMpcOptions(ProblemOptions):
         "auto"  # share of each new residual in the estimate, in (0, 1];
         # "auto" takes it from `task.sensor_noise`, 0.5 without any
     )
+    estimator_gain_scale: float = 1.0  # factor on the gain that "auto" takes; no gain exceeds 1
     iteration_limit: int = ITERATION_LIMIT  # active-set steps of a solve at most; 0: one that grows with it
 
     def __post_init__(self) -> None:
@@ -123,6 +124,17 @@ class VehicleMpcOptions(ProblemOptions):
         if own and not (is_number(self.estimator_gain) and 0.0 < self.estimator_gain <= 1.0):
             raise ValueError(
                 f"estimator_gain must be 'auto' or lie in (0, 1], got {shown(self.estimator_gain)}"
+            )
+        if not (is_number(self.estimator_gain_scale) and 0.0 < self.estimator_gain_scale < math.inf):
+            raise ValueError(
+                "estimator_gain_scale must be a finite number > 0, a factor on the gain that "
+                f"estimator_gain='auto' takes, got {shown(self.estimator_gain_scale)}"
+            )
+        if own and self.estimator_gain_scale != 1.0:
+            raise ValueError(
+                f"estimator_gain_scale={self.estimator_gain_scale} scales what estimator_gain='auto' "
+                f"takes, and estimator_gain is {self.estimator_gain}: give the product as estimator_gain, or "
+                "leave that at 'auto'"
             )
         require_whole(
             "iteration_limit (0: one that grows with the problem)", self.iteration_limit, 0, MOST_ITERATIONS
