@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
+from quad_envs.envs.tracking.kernel import step_flights
 from quad_envs.lanes import LANES
 from quad_envs.registration import TRACKING
 
@@ -177,3 +178,32 @@ def test_step_before_reset_is_refused():
 def test_an_empty_vector_is_refused(n):
     with pytest.raises(ValueError, match="num_envs must be a whole number >= 1"):
         gym.make_vec("quad/HelixTracking-v0", num_envs=n)
+
+
+def test_nothing_that_a_step_returned_changes_in_later_ones_or_is_shared_within_it():
+    env = gym.make_vec("quad/HelixTracking-v0", num_envs=N, tilt_limit=0.4)
+    env.reset(seed=0)
+    rng, kept, copies = np.random.default_rng(0), [], []
+    for _ in range(3):
+        *arrays, info = env.step(actions_of(rng, N))
+        kept.append([*arrays, *(values for name, values in info.items() if not name.startswith("_"))])
+        copies.append([array.copy() for array in kept[-1]])
+    for arrays, before in zip(kept, copies, strict=True):
+        for k, array in enumerate(arrays):
+            assert np.array_equal(array, before[k])
+            assert not any(np.shares_memory(array, other) for other in arrays[:k])
+            assert array.flags.writeable
+
+
+def test_actions_that_may_not_be_written_to_are_flown_as_others_and_compile_nothing():
+    envs = [gym.make_vec("quad/HelixTracking-v0", num_envs=N) for _ in range(2)]
+    actions = actions_of(np.random.default_rng(0), N)
+    fixed = actions.copy()
+    fixed.flags.writeable = False
+    for env in envs:
+        env.reset(seed=0)
+    forms = len(step_flights.entry.overloads)
+    for _ in range(3):
+        results = [env.step(given)[0] for env, given in zip(envs, (actions, fixed), strict=True)]
+        assert np.array_equal(*results)
+    assert len(step_flights.entry.overloads) == max(forms, 1)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...checks import array_bytes, require_memory
-from ...compilation.decorators import entry_of
+from ...compilation.decorators import DirectEntry, entry_of
 from ...compilation.packed import IntArray, pack
 from ...compilation.threads import Threads
 from ...disturbances import Disturbance
@@ -32,7 +32,7 @@ from .options import TrackingOptions
 from .scores import Scores, scores_of
 
 _tabulate_previews = entry_of(tabulate_previews)
-_step, _begin, _tell = entry_of(step_flights), entry_of(begin_flights), entry_of(tell_flights)
+_step, _begin, _tell = DirectEntry(step_flights), entry_of(begin_flights), entry_of(tell_flights)
 Generators = Sequence[np.random.Generator]
 
 
@@ -232,7 +232,7 @@ class TrackingBatch(PackedBatch):
             ValueError: If an action is not finite; then no flight has moved.
         """
         if self._threads is None:
-            ended = _step(self._words, actions, out, told, 0, self._blocks)
+            ended: int = _step.call(self._words, actions, out, told, 0, self._blocks)
         else:
             ended = self._step_in_threads(self._threads, actions, out, told)
         if ended < 0:
@@ -249,7 +249,7 @@ class TrackingBatch(PackedBatch):
     ) -> int:
         """As the kernel of `step`; each thread moves an equal share of the blocks."""
         found = threads.shares(
-            self._blocks, lambda _, begin, end: _step(self._words, actions, out, told, begin, end)
+            self._blocks, lambda _, begin, end: _step.call(self._words, actions, out, told, begin, end)
         )
         return min(found) if min(found) < 0 else sum(found)
 

@@ -20,10 +20,10 @@ from ...tasks import Task
 from ..shared.given import as_numbers, given_plants
 from ..shared.render_modes import NO_RENDERING, checked_rendering
 from ..shared.specified import Specified
-from ..shared.vector_parts import Generators, presence, seeded
+from ..shared.vector_parts import Generators, seeded
 from .batch import TrackingBatch
 from .options import TrackingOptions
-from .scores import Scores, info_of, scores_of
+from .scores import answer_of, blank_info
 
 if TYPE_CHECKING:
     from ..pictures import TrackingPictures
@@ -78,7 +78,7 @@ class TrackingVectorEnv(
             from ..pictures import TrackingPictures  # not needed by who trains and measures
 
             self._pictures = [TrackingPictures(self._batch, i, size) for i in range(num_envs)]
-        self._masks = presence(num_envs, info_of(scores_of(self._batch.fresh_scores())))
+        self._blank_info = blank_info(self._batch.fresh_scores())
         self.single_action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (self.task.layout.size,), np.float32)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -134,7 +134,7 @@ class TrackingVectorEnv(
         for i, pictures in enumerate(self._pictures):
             if mask[i]:
                 pictures.record()
-        return observations, self._info(scores_of(told))
+        return observations, answer_of(told, self._blank_info)[-1]
 
     def step(self, actions: NDArray[np.float32]) -> _Step:
         """Hold the rotor commands of all flights over one control period."""
@@ -143,23 +143,23 @@ class TrackingVectorEnv(
             raise ValueError(f"actions must have shape ({self.num_envs}, 4), got {actions.shape}")
         if not self._generators:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        again = self._any_done and self.autoreset_mode is AutoresetMode.NEXT_STEP
+        some_ended = self._any_done
+        again = some_ended and self.autoreset_mode is AutoresetMode.NEXT_STEP
         if again:
             actions = np.where(self._done[:, None], np.float32(0.0), actions)
         observations, told = self._fresh_observations(), self._batch.fresh_scores()
-        ended = self._batch.step(actions.reshape(-1), observations.reshape(-1), told)
+        ended = self._batch.step(actions.ravel(), observations.ravel(), told)
         if again:
             self._begin(np.flatnonzero(self._done), observations, told)
-        scores = scores_of(told)
-        if ended or self._any_done:
-            self._done = scores.crashed | scores.truncated
+        reward, crashed, truncated, info = answer_of(told, self._blank_info)
+        if ended or some_ended:
+            self._done = crashed | truncated
             self._any_done = bool(self._done.any())
-        info = self._info(scores)
         if self._any_done and self.autoreset_mode is AutoresetMode.SAME_STEP:
             info = self._begin_in_same_step(observations, info)
         for pictures in self._pictures:
             pictures.record()
-        return observations, scores.reward, scores.crashed, scores.truncated, info
+        return observations, reward, crashed, truncated, info
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """One picture of each flight, (height, width, 3), with `render_mode="rgb_array"`."""
@@ -195,7 +195,7 @@ class TrackingVectorEnv(
         told = self._batch.fresh_scores()
         self._begin(np.flatnonzero(done), observations, told)
         self._batch.tell(np.flatnonzero(~done), observations.reshape(-1), told)
-        fresh = self._info(scores_of(told))
+        *_, fresh = answer_of(told, self._blank_info)
         fresh["final_obs"], fresh["_final_obs"] = final, done.copy()
         last = {key: value.copy() for key, value in info.items() if not key.startswith("_")}
         fresh["final_info"] = last | {f"_{key}": done.copy() for key in last}
@@ -204,6 +204,3 @@ class TrackingVectorEnv(
 
     def _fresh_observations(self) -> Observations:
         return np.empty(self._shape, np.float32)
-
-    def _info(self, scores: Scores) -> dict[str, Any]:
-        return info_of(scores) | self._masks
