@@ -28,7 +28,7 @@ from baselines.sweeps.folder import read_run
 from benchmarks.trust import kills, malformed, observations, problems, repeat, soak
 from benchmarks.trust.__main__ import FIGURES, Outcome, table, try_out
 from controllers import CentralOptions, ConsensusOptions, LmpcOptions, SdcOptions
-from quad_envs import cooperative_estimation_v0
+from quad_envs import cooperative_estimation_v0, formation_v0
 
 HELIX = "quad/HelixTracking-v0"
 
@@ -57,6 +57,38 @@ def test_a_filter_that_was_told_nonsense_begins_anew(name):
     assert np.isfinite(action).all() and np.abs(action).max() <= 1.0
     action, state = policy.predict(usual, state, ~starts)
     assert np.isfinite(action).all() and np.isfinite(state.memory).all()
+
+
+def test_a_state_of_teams_that_is_not_finite_is_refused_by_its_row():
+    env = formation_v0.parallel_env(vehicles=3, formation="triangle")
+    policy = make_policy("central-mpc", env)
+    env.reset(seed=0)
+    states = np.tile(env.state(), (3, 1))
+    states[2, policy.task.state_slices["graph"].start] = np.nan  # which the program does not even read
+    with pytest.raises(ValueError, match="observation 2 is not finite: entry 0 of 'graph'"):
+        policy.predict(states)
+
+
+@pytest.mark.parametrize(
+    ("part", "size"),
+    [
+        (slice(0, 3), 1e37),  # p: a bound beyond OSQP's infinity, which it refused with an exception
+        (slice(9, 12), 1e20),  # Omega: a plan that is nan, which the next decision refused
+    ],
+)
+def test_a_team_whose_program_overflows_falls_back_and_decides_again(part, size):
+    env = formation_v0.parallel_env(vehicles=3, formation="triangle")
+    policy = make_policy("central-mpc", env)
+    env.reset(seed=0)
+    usual = np.array(env.state(), dtype=np.float64)[None]
+    _, state = policy.predict(usual)
+    wild = usual.copy()
+    wild[0, part] = size
+    action, state = policy.predict(wild, state)
+    assert np.isfinite(action).all() and np.abs(action).max() <= 1.0
+    assert state.fallbacks[0, 0] == 1 and np.isfinite(state.memory).all()
+    action, state = policy.predict(usual, state)
+    assert np.isfinite(action).all() and state.fallbacks[0, 0] == 2
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from quad_envs.parameters import N_INPUT, Array
 from quad_envs.tasks import TeamTask
 
 from .protocol import Actions, PolicyState
-from .rows import as_starts, state_of, times_left
+from .rows import as_starts, require_finite, state_of, times_left
 
 
 class CentralMpcPolicy:
@@ -73,7 +73,7 @@ class CentralMpcPolicy:
             Actions (n, N, action_size) float32, or (N, action_size) for one team, and the state to pass on.
 
         Raises:
-            ValueError: If a shape is wrong or a number is not finite.
+            ValueError: If a shape is wrong, or a number is not finite: it names the team's row and the part.
         """
         rows = np.asarray(observation, dtype=np.float64)
         one = rows.ndim == 1
@@ -83,6 +83,7 @@ class CentralMpcPolicy:
                 f"{self.name} sees env.state(), (n, {self._size}) or ({self._size},), got shape "
                 f"{np.shape(observation)}"
             )
+        require_finite(rows, self._slices)
         n, start = len(rows), as_starts(episode_start, len(rows))
         state = state_of(state, n, self.memory_size)
         actions = np.zeros((n, self.task.vehicles, self.task.action_size), dtype=np.float32)

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-import random
+import re
 import warnings
 from collections.abc import Iterator
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from baselines.evaluation.rollout import is_privileged
 from baselines.policies.environments import make_env
 from baselines.policies.registry import TEAM_POLICIES, TRACKING_POLICIES, make_policy
 from baselines.policies.trained import shipped_policies
 from quad_envs.parameters import Array
 from quad_envs.registration import TEAMS
 
-from .found import Found
+from .found import Found, tried
+
+Flags = NDArray[np.bool_]
 
 _ENVS = {
     "tracking": "quad/CorridorTracking-v0",
@@ -25,6 +30,8 @@ _ENVS = {
 }
 _HUGE = (1e2, 1e4, 1e8, 1e20, 1e37)
 _BAD = (np.nan, np.inf, -np.inf)
+_ROWS = (1, 2, 4, 5, 16, 33)  # of a batch: up to four are decided in another way than more
+_STARTS = 4
 
 
 def fliers() -> list[tuple[str, str]]:
@@ -48,65 +55,136 @@ def _place(network: str) -> str:
 
 
 def wild(rng: np.random.Generator, usual: Array) -> tuple[Array, bool]:
-    """Wild observations (rows, entries) of the shape of usual ones, and whether all are finite."""
+    """A wild observation (entries,) made from a usual one, and whether it is finite."""
     kind = rng.integers(6)
     found = usual.astype(np.float64)
-    row, share = rng.integers(len(found)), rng.random(found.shape) < rng.choice([0.02, 0.2, 1.0])
     if kind == 0:  # some entries are huge
+        share = rng.random(found.shape) < rng.choice([0.02, 0.2, 1.0])
         found = np.where(share, rng.choice(_HUGE) * rng.normal(size=found.shape), found)
     elif kind == 1:  # all of them are of other sizes
         found = rng.normal(size=found.shape) * 10.0 ** rng.uniform(-3.0, 6.0)
     elif kind == 2:  # tilted as far as no model holds, and turning
-        found[row, 3:5] = rng.uniform(-np.pi, np.pi, 2)
-        found[row, 7:10] = 10.0 ** rng.uniform(0.0, 4.0) * rng.normal(size=3)
+        found[3:5] = rng.uniform(-np.pi, np.pi, 2)
+        found[7:10] = 10.0 ** rng.uniform(0.0, 4.0) * rng.normal(size=3)
     elif kind == 3:  # nothing at all
         found[:] = rng.choice([0.0, -0.0, 1e-300])
     elif kind == 4:  # on the edge of float32
-        found[row] = rng.choice([-1.0, 1.0], found.shape[1]) * float(np.finfo(np.float32).max)
+        found[:] = rng.choice([-1.0, 1.0], len(found)) * float(np.finfo(np.float32).max)
     else:
-        found[row, rng.integers(found.shape[1])] = rng.choice(_BAD)
+        found[rng.integers(len(found))] = rng.choice(_BAD)
     with np.errstate(over="ignore"):
         found = found.astype(np.float32)
     return found, bool(np.isfinite(found).all())
 
 
+class Usual(NamedTuple):
+    """Observations at starts, and what follows from them."""
+
+    rows: Array  # (rows, entries)
+    state: Any  # after a first decision
+    decided: Array  # by the next one
+
+
+class Flier(NamedTuple):
+    """A policy and usual observations of it, for batches of each size."""
+
+    what: str
+    policy: Any
+    usual: dict[int, Usual]
+
+
+def flier(name: str, env_id: str, seed: int) -> Flier:
+    """A policy with what it sees at some starts: rows of agents, or of whole teams if it sees the truth."""
+    env, options = make_env(env_id), {}
+    if is_privileged(make_policy(name, env)):  # one program over a whole team: small, and soon given up
+        env, options = make_env(env_id, vehicles=3, formation="lattice"), {"max_iter": 1000}
+    policy, seen = make_policy(name, env, **options), []
+    for k in range(_STARTS):
+        first = env.reset(seed=seed + k)[0]
+        if env_id not in TEAMS:
+            seen.append(first)
+        elif is_privileged(policy):
+            seen.append(env.state())
+        else:
+            seen += list(first.values())
+    sizes = {n: np.resize(np.array(seen, dtype=np.float32), (n, len(seen[0]))) for n in _ROWS}
+    return Flier(f"{name} in {env_id}", policy, {n: _usual(policy, rows) for n, rows in sizes.items()})
+
+
+def _usual(policy: Any, rows: Array) -> Usual:
+    _, state = policy.predict(rows, None, np.ones(len(rows), dtype=np.bool_))
+    return Usual(rows, state, policy.predict(rows, state, np.zeros(len(rows), dtype=np.bool_))[0])
+
+
+class Batch(NamedTuple):
+    """Observations of which some are wild."""
+
+    rows: Array  # (rows, entries)
+    wild: Flags  # (rows,)
+    finite: Flags  # (rows,)
+
+
+def batch(rng: np.random.Generator, usual: Array, wild_rows: int) -> Batch:
+    """Usual rows of which so many have become wild."""
+    rows, places = usual.copy(), rng.permutation(len(usual))[:wild_rows]
+    is_wild, finite = np.zeros(len(rows), dtype=np.bool_), np.ones(len(rows), dtype=np.bool_)
+    for j in places:
+        rows[j], finite[j] = wild(rng, rows[j])
+    is_wild[places] = True
+    return Batch(rows, is_wild, finite)
+
+
 def observations(seed: int) -> Iterator[Found]:
-    """Wild observations without end, to every policy in turn."""
-    made: list[tuple[str, Any, Array]] = []
+    """Wild observations without end, alone or in a batch, as many to every policy in turn."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for name, env_id in fliers():
-            env = make_env(env_id)
-            first = env.reset(seed=seed)[0]
-            usual = np.array(list(first.values())) if env_id in TEAMS else first[None]
-            made.append((f"{name} in {env_id}", make_policy(name, env), usual))
+        made = [flier(name, env_id, seed) for name, env_id in fliers()]
     rng = np.random.default_rng(seed)
-    random.seed(seed)
     while True:
+        rows = int(rng.choice(_ROWS))
+        wild_rows = int(rng.integers(rows // 2, rows)) + 1
         for what, policy, usual in made:
-            found, finite = wild(rng, usual)
+            some = batch(rng, usual[rows].rows, wild_rows)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                wrong = _answered(policy, usual, found, finite)
-            yield Found(1, (f"{what}: {wrong}",) if wrong else ())
+                found = tried(f"{what}, {rows} rows", partial(answered, policy, usual[rows], some))
+            yield found._replace(tried=wild_rows)
 
 
-def _answered(policy: Any, usual: Array, found: Array, finite: bool) -> str:
-    """What is wrong with the answer: at once, or after a usual decision and followed by another."""
-    try:
-        _, state = policy.predict(usual, None, np.ones(len(usual), dtype=np.bool_))
-        action, state = policy.predict(found, state, np.zeros(len(usual), dtype=np.bool_))
-    except ValueError as error:
-        said = str(error)
-        return "" if 0 < len(said) < 2000 else f"an error of {len(said)} characters"
-    except Exception as error:
-        return f"{type(error).__name__}: {error}"
-    if not finite:
+def answered(policy: Any, usual: Usual, some: Batch) -> str:
+    """What is wrong with the answer to wild rows after a usual decision, and with the one that follows."""
+    given, left = some.rows.copy(), some.wild.copy()
+    goes_on = np.zeros(len(given), dtype=np.bool_)
+    while True:  # every error takes a row
+        try:
+            action, state = policy.predict(given, usual.state, goes_on)
+            break
+        except ValueError as error:
+            wrong, row = _refused(str(error), left)
+            if wrong:
+                return wrong
+            given[row], left[row] = usual.rows[row], False
+    if not some.finite[left].all():
         return "what is not finite was decided"
-    if not (np.isfinite(action).all() and (np.abs(action) <= 1.0).all()):
-        return f"the action is {np.asarray(action).min()} to {np.asarray(action).max()}"
-    try:
-        action, _ = policy.predict(usual, state, np.zeros(len(usual), dtype=np.bool_))
-    except Exception as error:
-        return f"afterwards {type(error).__name__}: {error}"
-    return "" if np.isfinite(action).all() else "it does not recover"
+    if not np.array_equal(action[~left], usual.decided[~left]):
+        return "a wild row changes what is decided for those beside it"
+    after, _ = policy.predict(usual.rows, state, goes_on)
+    return _outside(action) or _outside(after, "afterwards ")
+
+
+def _refused(said: str, left: Flags) -> tuple[str, int]:
+    """What is wrong with an error, and of which row it speaks: one of those that are left."""
+    named = re.search(r"\bobservation (\d+)\b", said)
+    if not 0 < len(said) < 2000 or not named:
+        return f"an error that names no row: {said[:200]}", -1
+    row = int(named[1])
+    if row >= len(left) or not left[row]:
+        return f"an error of row {row}, which is not wild: {said[:200]}", -1
+    return "", row
+
+
+def _outside(action: Array, when: str = "") -> str:
+    """What is wrong with actions: they are finite, and from -1 to 1."""
+    if np.isfinite(action).all() and (np.abs(action) <= 1.0).all():
+        return ""
+    return f"{when}the action is {np.asarray(action).min()} to {np.asarray(action).max()}"

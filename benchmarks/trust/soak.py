@@ -9,10 +9,13 @@ from itertools import count
 
 import numpy as np
 
+from quad_envs.registration import TEAMS
+
 from . import drawn
 from .found import Found
 
-STEPS = 2000  # of a vehicle or a row, in one environment
+STEPS = 2000  # of an environment alone; the widest vectors fly an eighth of them
+_COPIES = ((1, 4, 17, 64, 256), (1, 3, 4, 17, 64))  # of a vector of vehicles, and of teams
 _GROWTH = 8e6  # bytes by which memory may grow over the second half of these steps
 _PAGE = 4096
 
@@ -24,24 +27,28 @@ def resident() -> int:
 
 
 def soak(seed: int) -> Iterator[Found]:
-    """Environments without end: each id in turn, singly (with its team) and as a vector; tries are steps."""
+    """Environments without end: of the id with the fewest steps, singly (with its team) and as a vector."""
+    flown = dict.fromkeys(drawn.IDS, 0)
     for k in count():
         rng = random.Random(f"{seed} {k}")
-        env_id = drawn.IDS[k // 2 % len(drawn.IDS)]
-        copies = rng.choice([1, 3, 4, 17, 64]) if k % 2 else 0
-        yield _fly(drawn.draw(rng, env_id, copies), k)
+        if k % 2 == 0:
+            env_id = min(flown, key=lambda one: flown[one])
+        copies = rng.choice(_COPIES[env_id in TEAMS]) if k % 2 else 0
+        found = _fly(drawn.draw(rng, env_id, copies), k)
+        flown[env_id] += found.tried
+        yield found
 
 
 def _fly(flown: drawn.Drawn, seed: int) -> Found:
     rng = np.random.default_rng(seed)
-    wrong, growth, rows, made = "", 0.0, 1, 0
+    wrong, growth, steps, made = "", 0.0, 0, 0
     try:
         wrong = _bad(drawn.reset(flown.env, seed), None)
         while made < STEPS and not wrong:
             found = drawn.step(flown.env, rng)
             wrong = _bad(found.observations, found.rewards)
-            rows = max(1, len(found.rewards))
-            made += max(1, rows // 8)  # a wide vector is no reason to fly it for minutes
+            steps += max(1, len(found.rewards))
+            made += min(max(1, len(found.rewards) // 8), 8)  # a wide vector need not fly for minutes
             if found.ended:
                 wrong = wrong or _bad(drawn.reset(flown.env), None)
             if growth == 0.0 and made >= STEPS // 2:
@@ -54,7 +61,6 @@ def _fly(flown: drawn.Drawn, seed: int) -> Found:
     except Exception as error:
         wrong = f"{type(error).__name__}: {error}"
     flown.env.close()
-    steps = made // max(1, rows // 8) * rows
     return Found(steps, (f"{flown.what}: {wrong}",) if wrong else (), max(0.0, growth) / 1e6)
 
 

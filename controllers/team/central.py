@@ -173,6 +173,8 @@ class CentralMpc:
         inputs = (forces - hover).reshape(n, N * N_INPUT)
         positions = [(part.S @ inputs[i] + part.f)[1:, POSITION] for i, part in enumerate(condensed)]
         memory = np.concatenate([[float(level <= PREVIOUS_PLAN)], forces.ravel(), np.ravel(positions)])
+        if not np.isfinite(memory).all():  # so far away that nobody knows where: the next sample starts anew
+            memory = np.zeros(self.memory_size)
         left = [
             left_model(level, part.f[0], part.S @ inputs[i] + part.f, part.f[:1], *self._validity)
             for i, part in enumerate(condensed)
@@ -315,7 +317,9 @@ class CentralMpc:
 
     def _solve(self, sample: _Sample) -> tuple[Array | None, int]:
         """The inputs of all vehicles, or None; OSQP's iterations."""
-        if not all(np.isfinite(part).all() for part in (sample.H, sample.g, sample.A)):
+        lower, upper = np.maximum(sample.lower, -_NO_BOUND), np.minimum(sample.upper, _NO_BOUND)
+        held = (lower <= upper).all()  # not if one is beyond what counts as a bound, nor if it is nan
+        if not (held and all(np.isfinite(part).all() for part in (sample.H, sample.g, sample.A))):
             return None, 0
         size = self.task.vehicles * N_INPUT * self.horizon
         vehicles = self.task.vehicles
@@ -323,7 +327,6 @@ class CentralMpc:
         triangle[:size, :size] = np.triu(np.kron(np.eye(vehicles), np.ones((size // vehicles,) * 2))) > 0.0
         P = _csc(triangle, sample.H.T[triangle.T])
         A = _csc(self._mask, sample.A.T[self._mask.T])
-        lower, upper = np.maximum(sample.lower, -_NO_BOUND), np.minimum(sample.upper, _NO_BOUND)
         solver = osqp.OSQP()
         solver.setup(P, sample.g, A, lower, upper, verbose=False, **self._settings)
         result = solver.solve(raise_error=False)
