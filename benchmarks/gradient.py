@@ -17,6 +17,7 @@ one_thread()
 import numpy as np  # noqa: E402
 
 from baselines.evaluation.table import format_table  # noqa: E402
+from baselines.training.features import training_features  # noqa: E402
 from baselines.training.team_flights import DifferentiableTeams  # noqa: E402
 from quad_envs.envs.team.options import FormationOptions  # noqa: E402
 
@@ -47,7 +48,8 @@ def window(flights: DifferentiableTeams, steps: int) -> tuple[float, float, floa
 def measure(teams: int, steps: int) -> dict[str, float]:
     """Agent-steps per CPU-second, of each part and of all."""
     options = FormationOptions(formation="hexagon", substeps=_SUBSTEPS, max_cycles=_CYCLES)
-    flights = DifferentiableTeams(options, teams * options.vehicles, 0, _STAGES, 0.55)
+    features = training_features(options, _STAGES)
+    flights = DifferentiableTeams(options, teams * options.vehicles, 0, features, 0.55)
     window(flights, 2)  # compiles
     parts = np.min([window(flights, steps) for _ in range(_WINDOWS)], axis=0)
     per_step = parts / (steps * flights.n)

@@ -145,9 +145,9 @@ def test_what_is_revealed_is_not_estimated_again():
     assert np.abs(obs[-6:]).max() < 0.01
 
 
-def test_teams_and_other_environments_have_no_estimate():
-    with pytest.raises(ValueError, match="estimated for one vehicle, and quad/Formation-v0 is a task of"):
-        DisturbanceEstimator(task_of("quad/Formation-v0"))
+def test_vehicles_on_rails_and_other_environments_have_no_estimate():
+    with pytest.raises(ValueError, match="of vehicles that fly, and quad/CooperativeEstimation-v0 is a task"):
+        DisturbanceEstimator(task_of("quad/CooperativeEstimation-v0"))
     with pytest.raises(ValueError, match="in a tracking environment of this suite"):
         DisturbanceEstimateWrapper(gym.make("CartPole-v1"))
 
@@ -188,13 +188,13 @@ def test_training_flights_show_networks_what_they_see_in_flight():
         start = flights.advance(np.zeros((6, 4), dtype=np.float32)).done
 
 
-def test_a_team_is_not_trained_with_it():
+def test_a_team_is_not_trained_in_axes_of_a_heading():
     pytest.importorskip("torch")
     from baselines.training.features import training_features
     from baselines.training.held_out import training_options
 
-    with pytest.raises(ValueError, match="hyperparameter disturbance_estimate is for one vehicle"):
-        training_features(training_options("quad/Formation-v0", {}), disturbance_estimate=True)
+    with pytest.raises(ValueError, match="hyperparameter heading_axes is for one vehicle"):
+        training_features(training_options("quad/Formation-v0", {}), heading_axes=True)
 
 
 def test_a_model_of_sb3_under_both_wrappers_flies_from_its_checkpoint(tmp_path):

@@ -7,7 +7,7 @@ differs from the nominal model. Networks cannot remember; this is what they are 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +25,11 @@ from quad_envs.compilation.decorators import entry_of, kernel
 from quad_envs.observations.features import Features
 from quad_envs.observations.tracking import decode_own
 from quad_envs.parameters import N_INPUT, Array
-from quad_envs.tasks import BaseTask, Task
+from quad_envs.tasks import BaseTask, Task, TeamTask
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float32]
+AnyTask = TypeVar("AnyTask", bound=Task | TeamTask)
 _PART = "disturbance_estimate"  # of a layout, and of the names of features
 _COMMAND = slice(ESTIMATOR_SIZE - N_INPUT, ESTIMATOR_SIZE)  # in the estimator's memory
 _SCRATCH = PLANT_SIZE + N_INPUT + 2 * N_DISTURBANCE + ESTIMATOR_SCRATCH
@@ -96,32 +97,34 @@ def sees_estimate(features: Features) -> bool:
     return any(name.startswith(_PART) for name in features.names)
 
 
-def with_estimate(task: Task) -> Task:
+def with_estimate(task: AnyTask) -> AnyTask:
     """The task as who is given the estimate sees it."""
-    return replace(task, layout=replace(task.layout, disturbance_estimate=True))
+    layout: Any = replace(task.layout, disturbance_estimate=True)
+    return replace(task, layout=layout)
 
 
 class DisturbanceEstimator:
-    """Estimators of the disturbance, one per row of observations.
+    """Estimators of the disturbance, one per row of observations: of one vehicle, or of an agent of a team.
 
-    Their gain follows from the task's `sensor_noise`, as that of the MPCs' does. What they know stands in the
-    memory that the caller keeps, (n, `memory_size`), zeros at first.
+    Each knows its own row alone. Their gain follows from the `sensor_noise` of the task, as that of the MPCs.
+    What they know stands in the memory that the caller keeps, (n, `memory_size`), zeros at first.
 
     Args:
         task: Where observations come from.
 
     Raises:
-        ValueError: If it is the task of a team, whose observations are others.
+        ValueError: If it is one in which rotors command nothing.
     """
 
     memory_size = ESTIMATOR_SIZE
 
     def __init__(self, task: BaseTask) -> None:
-        if not isinstance(task, Task):
+        if not isinstance(task, Task | TeamTask) or task.mission == "estimation":
             raise ValueError(
-                f"disturbances are estimated for one vehicle, and {task.env_id} is a task of {task.mission}"
+                f"disturbances are estimated of vehicles that fly, and {task.env_id} is a task of "
+                f"{task.mission}"
             )
-        self.given, self.task = task, with_estimate(task)
+        self.task = with_estimate(task)
         revealed = task.layout.slices.get("disturbance")
         self._revealed_at = -1 if revealed is None else revealed.start
         self._gain, self._coefficients = estimator_gains(task), task.params.coefficients()

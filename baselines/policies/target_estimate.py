@@ -74,7 +74,3 @@ class TargetBelief:
         nobody = Heard(np.zeros((n, K, 6)), np.zeros((n, K, 6, 6)), np.zeros((n, K), dtype=np.bool_))
         seen = np.concatenate([obs, estimate_block(done.filters, nobody)], axis=1)
         return Believed(seen, done.filters, done.estimates)
-
-    def extend(self, obs: Actions, memory: Array, start: Flags) -> tuple[Actions, Array]:
-        """Observations with the estimates, and the memory to keep; arguments as of `believe`."""
-        return self.believe(obs, memory, start)[:2]

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import pairwise
 
-from quad_envs.observations.features import Features
+import numpy as np
 
+from quad_envs.observations.features import Features, default_features
+from quad_envs.tasks import Task, TeamTask
+
+from ..policies.disturbance_estimate import sees_estimate, with_estimate
 from ..policies.network import Network, Squash
 
 # Part of an observation -> how a training comes to see as many rows of it as the network.
@@ -16,8 +21,31 @@ _REMEDIES = {
     "preview": "give the same stages (--hyper stages=[{1}])",
     "measured": "choose the graph and the sensor that it was trained with",
     "estimate": "choose the graph and the sensor that it was trained with",
+    "disturbance_estimate": "let the training see it, too (--hyper disturbance_estimate=true)",
 }
 _ELSE = "begin with a network of the same task and limits"
+
+
+def with_estimate_inputs(network: Network, task: Task | TeamTask) -> Network:
+    """The network with inputs for an estimate of the disturbance, to which it does not listen yet.
+
+    Args:
+        network: What it decides stays as it is; one that has such inputs is returned as it is.
+        task: Where it is to be trained.
+    """
+    seen = network.features
+    if sees_estimate(seen):
+        return network
+    more, before = default_features(with_estimate(task).layout), len(default_features(task.layout).names)
+    features = replace(
+        seen,
+        names=seen.names + more.names[before:],
+        mean=seen.mean + more.mean[before:],
+        scale=seen.scale + more.scale[before:],
+    )
+    first, *rest = network.weights
+    deaf = np.zeros((len(features.names) - len(seen.names), first.shape[1]), dtype=np.float32)
+    return replace(network, features=features, weights=(np.concatenate([first, deaf]), *rest))
 
 
 def require_continuable(

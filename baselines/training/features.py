@@ -61,10 +61,10 @@ def training_features(
         raise ValueError(
             f"hyperparameter stages: the preview has stages 0 to {layout.preview}, got {shown(stages)}"
         )
+    layout = replace(layout, disturbance_estimate=disturbance_estimate)
     if not isinstance(options, TeamOptions):
-        own = replace(options.task.layout, disturbance_estimate=disturbance_estimate)
-        return replace(default_features(own, stages), heading_axes=heading_axes)
-    require_plain(options, disturbance_estimate, heading_axes)
+        return replace(default_features(layout, stages), heading_axes=heading_axes)
+    require_own_axes(options, heading_axes)
     features = default_features(layout, stages)
     used = in_neighbours(options.graphs.graphs).shape[1]
     empty = tuple(
@@ -86,14 +86,13 @@ def training_features(
     )
 
 
-def require_plain(options: TeamOptions, disturbance_estimate: bool, heading_axes: bool) -> None:
-    """Refuse in a team what is for one vehicle.
+def require_own_axes(options: TeamOptions, heading_axes: bool) -> None:
+    """Refuse in a team the axes that are for one vehicle.
 
     Raises:
-        ValueError: If one of them is asked for.
+        ValueError: If they are asked for.
     """
-    for name, asked in (("disturbance_estimate", disturbance_estimate), ("heading_axes", heading_axes)):
-        if asked:
-            raise ValueError(
-                f"hyperparameter {name} is for one vehicle, and {options.env_id} has several: leave it out"
-            )
+    if heading_axes:
+        raise ValueError(
+            f"hyperparameter heading_axes is for one vehicle, and {options.env_id} has several: leave it out"
+        )

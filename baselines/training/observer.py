@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from quad_envs.encoding import Encoder, Encoding
 from quad_envs.tasks import Task, TeamTask
 
-from ..policies.disturbance_estimate import Bools, DisturbanceEstimator, Floats, sees_estimate
-from ..policies.target_estimate import TargetBelief, sees_target_estimate
+from ..policies.disturbance_estimate import Bools, Floats
+from ..policies.estimators import Estimators, asks_for_estimates
 
 
 class Observer:
-    """Observations to features, row by row; with an estimate of disturbance or target, if it is seen.
+    """Observations to features, row by row; with estimates of disturbance and target, where they are seen.
 
     Args:
         encoding: What the network sees and commands.
@@ -25,13 +25,10 @@ class Observer:
     """
 
     def __init__(self, encoding: Encoding, task: Task | TeamTask, n: int) -> None:
-        self._estimator: DisturbanceEstimator | TargetBelief | None = None
-        if isinstance(task, TeamTask) and sees_target_estimate(encoding.features, task):
-            self._estimator = TargetBelief(task)
-        elif sees_estimate(encoding.features):
-            self._estimator = DisturbanceEstimator(task)
-        self.encoder = Encoder(encoding, task if self._estimator is None else self._estimator.task)
-        self._memory = np.zeros((n, 0 if self._estimator is None else self._estimator.memory_size))
+        asked = asks_for_estimates(encoding.features, task)
+        self._estimators = Estimators(encoding.features, task) if asked else None
+        self.encoder = Encoder(encoding, task if self._estimators is None else self._estimators.task)
+        self._memory = np.zeros((n, 0 if self._estimators is None else self._estimators.memory_size))
 
     def see(
         self, observations: Floats, begins: Bools | None = None, rows: NDArray[np.int64] | None = None
@@ -43,9 +40,9 @@ class Observer:
             begins: (m,), which begin an episode; None for none.
             rows: Which rows these are, (m,); None for all.
         """
-        if self._estimator is None:
+        if self._estimators is None:
             return self.encoder.see(observations)
         where = slice(None) if rows is None else rows
         start = np.zeros(len(observations), dtype=np.bool_) if begins is None else begins
-        seen, self._memory[where] = self._estimator.extend(observations, self._memory[where], start)
+        seen, self._memory[where], _ = self._estimators.extend(observations, self._memory[where], start)
         return self.encoder.see(seen)

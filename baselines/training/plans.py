@@ -14,6 +14,7 @@ from ..policies.network import Network
 from ..policies.trained import checkpoint_folder
 from .algorithm_options import check_sizes
 from .algorithms import algorithm_for, check_training, require_packages, require_resumable
+from .beginning import with_estimate_inputs
 from .clock import Budget
 from .held_out import Point, read_point, training_options
 from .hyperparameters import hyperparameters, plain_options
@@ -81,6 +82,8 @@ def make_plan(request: TrainingRequest) -> Plan:
     check_sizes(options, task_options.task.layout.size)
     source = request.start_from
     network, origin = (None, None) if source is None else _origin(source, algorithm)
+    if network is not None and getattr(options, "disturbance_estimate", False):
+        network = with_estimate_inputs(network, task_options.task)
     check_training(algorithm, task_options, options, network)
     made_by = replace(request, env_id=env_id, seconds=budget.seconds, out=None, resume=False)
     about = {

@@ -26,7 +26,7 @@ from ..policies.network import Floats, Network, Squash
 from .algorithm_options import PolicyGradientOptions
 from .beginning import require_continuable
 from .differentiable import Flights, S
-from .features import require_plain, training_features
+from .features import require_own_axes, training_features
 from .flights import DifferentiableFlights
 from .held_out import Progress
 from .team_flights import DifferentiableTeams, require_differentiable
@@ -133,7 +133,7 @@ def check(
     """
     if isinstance(task_options, TeamOptions):
         require_differentiable(task_options, options.separation)
-        require_plain(task_options, options.disturbance_estimate, options.heading_axes)
+        require_own_axes(task_options, options.heading_axes)
     else:
         for name in ("stages", "separation", "episode_steps"):
             if getattr(options, name) is not None:
@@ -155,7 +155,8 @@ def _flights_of(
         longest = task_options.task.episode_steps
         cycles = min(options.episode_steps or longest, longest)
         trained = replace(task_options, terminate="team", substeps=options.substeps, max_cycles=cycles)
-        return DifferentiableTeams(trained, options.n_envs, seed, options.stages, options.separation)
+        features = training_features(trained, options.stages, options.disturbance_estimate)
+        return DifferentiableTeams(trained, options.n_envs, seed, features, options.separation)
     flown = replace(task_options, substeps=options.substeps)
     features = training_features(flown, None, options.disturbance_estimate, options.heading_axes)
     return DifferentiableFlights(flown, options.n_envs, seed, features)

@@ -49,7 +49,8 @@ def check(task_options: TaskOptions, options: PpoOptions | SacOptions, start: Ne
         return
     require_measured(task_options)
     if start is not None:
-        features = training_features(task_options, options.stages)
+        sees = options.disturbance_estimate, options.heading_axes
+        features = training_features(task_options, options.stages, *sees)
         require_continuable(start, features, options.net_arch, 4, "clip")
 
 

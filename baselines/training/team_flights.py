@@ -51,7 +51,8 @@ class DifferentiableTeams:
         options: Of the task; see `require_differentiable`.
         n: Number of vehicles of all teams, rounded down to whole teams, but at least one.
         seed: Of the starts.
-        stages: Of the preview that the network sees; None for the usual ones.
+        features: That a network sees, of `training_features`; None for the default ones. No gradient passes
+            through estimates.
         separation: m, below which the cost counts the distance between vehicles; None for the task's own.
 
     Raises:
@@ -63,7 +64,7 @@ class DifferentiableTeams:
         options: TeamOptions,
         n: int,
         seed: int,
-        stages: tuple[int, ...] | None = None,
+        features: Features | None = None,
         separation: float | None = None,
     ) -> None:
         require_differentiable(options, separation)
@@ -74,9 +75,10 @@ class DifferentiableTeams:
         self.batch = TeamBatch(options, self.teams)
         self.task = self.batch.task
         self._kept = options.separation if separation is None else float(separation)
-        self._observer = Observer(Encoding(training_features(options, stages)), self.task, self.n)
+        self._observer = Observer(Encoding(features or training_features(options)), self.task, self.n)
         seen = self._observer.encoder.task.layout
         self._columns, self._width = self.features.columns(seen), seen.size
+        self._believed = seen.slices.get("estimate")  # what a filter of its own says of the target
         self._scale = np.asarray(self.features.scale)
         self._scratch = team_scratch(self._size, options.substeps, self.task.layout.sensed)
         self._out = np.empty((self.n, self.task.layout.size), dtype=np.float32)
@@ -109,15 +111,16 @@ class DifferentiableTeams:
         Those to motions that were sent earlier wait for their step: go back step by step. What a filter
         believes of a target is given; where it is relative to the vehicle is not.
         """
-        full, shown = np.zeros((self.n, self._width)), self.task.layout.size
+        full = np.zeros((self.n, self._width))
         full[:, self._columns] = bar / self._scale
         plants, commands, arrays = np.empty((self.n, N_PLANT)), np.empty((self.n, N_INPUT)), self.batch.arrays
         observe_teams_vjp(
             step.record, step.t, arrays.tables, arrays.task, arrays.team, full, self._owed, plants, commands,
             self._scratch,
         )  # fmt: skip
-        if self._width > shown:
-            plants[:, :3] -= full[:, shown + 1 : shown + 4]
+        if self._believed is not None:
+            first = self._believed.start + 1
+            plants[:, :3] -= full[:, first : first + 3]
         return plants, commands
 
     def advance(self, actions: Floats) -> TeamStep:

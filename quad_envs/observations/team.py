@@ -12,6 +12,7 @@
 | measured | (1 + K) x 5 | valid, range, sin, cos of azimuth, elevation: own, then per comm slot |
 | slot | 3 | wanted position relative to the target |
 | estimate | (1 + K) x 13 | from the estimate wrapper: valid, r - p_i 3, v 3, position covariance 6 |
+| disturbance_estimate | 6 | torque and force as they were estimated, where somebody appends them |
 
 Positions are relative to the observing vehicle i, axes inertial (NED), SI units, unscaled. A neighbour keeps
 its comm slot for the whole episode; while nothing valid was heard of it, the slot is zero.
@@ -78,6 +79,7 @@ class AgentLayout:
     disturbance: bool = False
     target: bool = False  # whether there are `measured` and `slot`
     estimate: bool = False  # whether the estimate wrapper added its block
+    disturbance_estimate: bool = False  # behind the rest, where somebody estimates
 
     def __post_init__(self) -> None:
         for name in ("preview", "neighbours", "sensed", "plan"):
@@ -109,6 +111,7 @@ class AgentLayout:
             ("measured", (1 + K, N_MEASURED), self.target),
             ("slot", (3,), self.target),
             ("estimate", (1 + K, N_ESTIMATE), self.estimate),
+            ("disturbance_estimate", (6,), self.disturbance_estimate),
         ]
         return {name: shape for name, shape, present in parts if present}
 
