@@ -13,7 +13,7 @@ from gymnasium.utils import seeding
 
 from quad_envs import Gusts, Steady
 from quad_envs.compilation.decorators import kernel
-from quad_envs.compilation.intrinsics import take_nearer
+from quad_envs.compilation.intrinsics import _take_nearest, take_nearest
 from quad_envs.constraints import (
     TOLERANCE,
     constraint_scales,
@@ -254,20 +254,34 @@ def test_blocks_read_what_was_written():
 
 
 @kernel
-def _nearest(places, points):
-    for i in range(len(points)):
-        take_nearer(places, np.int64(0), points[i, 0], points[i, 1], points[i, 2])
+def _nearest(places, n):
+    for at in range(0, places.size, 4 * LANES):
+        take_nearest(places, at, min(LANES, n - at // 4))
 
 
-def test_four_places_take_the_squared_distance_of_the_nearest_point():
-    rng = np.random.default_rng(0)
-    places, points = rng.normal(size=(4, 4)), rng.normal(size=(7, 3))
-    places[3] = np.inf
-    expected = ((places[:3].T[:, None] - points) ** 2).sum(axis=2).min(axis=1)
-    block = places.ravel().copy()
-    _nearest(block, points)
-    np.testing.assert_allclose(block[12:], expected, rtol=1e-15)
-    assert np.array_equal(block[:12], places[:3].ravel())
+@pytest.mark.parametrize("n", [1, 3, 4, 6, 13])
+def test_places_take_the_squared_distance_of_the_nearest_other_one(n):
+    count = -(-n // LANES) * LANES
+    points = np.full((count, 4), 1e9)  # behind the last one nobody is near
+    points[:n, :3] = np.random.default_rng(0).normal(size=(n, 3))
+    points[n // 2, 1] = np.nan if n > 4 else points[n // 2, 1]  # who is nowhere is near nobody
+    points[:, 3] = np.inf
+    squares = ((points[:n, None, :3] - points[:n, :3]) ** 2).sum(axis=2)
+    squares[np.arange(n), np.arange(n)] = np.inf
+    expected = np.fmin.reduce(squares, axis=1)
+    places = np.ascontiguousarray(points.reshape(-1, LANES, 4).transpose(0, 2, 1)).ravel()
+    before = places.copy()
+    _nearest(places, n)
+    after = places.reshape(-1, 4, LANES)
+    assert np.array_equal(after[:, :3], before.reshape(-1, 4, LANES)[:, :3], equal_nan=True)
+    found = after[:, 3].ravel()[:n]
+    known = np.isfinite(points[:n, :3]).all(axis=1) & np.isfinite(expected)
+    np.testing.assert_allclose(found[known], expected[known], rtol=1e-15)
+    assert (found[~known] > 1e17).all()
+    twin = before.copy()
+    for at in range(0, twin.size, 4 * LANES):
+        _take_nearest(twin, at, min(LANES, n - at // 4))
+    np.testing.assert_allclose(places, twin, rtol=1e-15)
 
 
 @pytest.mark.parametrize("group", [11, 3])

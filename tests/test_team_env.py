@@ -315,6 +315,10 @@ def test_an_unknown_argument_names_the_nearest():
         (lambda actions: actions.update(quad_2="up"), "action of quad_2 must be 4 numbers"),
         (lambda actions: actions.update(quad_2=np.zeros((1, 4))), "action of quad_2 must be 4 numbers"),
         (
+            lambda actions: actions.update(dict.fromkeys(actions, np.zeros((4, 1), np.float32))),
+            "action of quad_0 must be 4 numbers",
+        ),
+        (
             lambda actions: actions.update(quad_2=np.zeros(3), quad_3=np.zeros(5)),
             "action of quad_2 must be 4 numbers",
         ),
@@ -410,3 +414,17 @@ def test_actions_outside_the_box_are_clipped_and_counted():
     twin.step({name: np.ones(4, np.float32) for name in twin.agents})
     assert np.array_equal(env.plants, twin.plants)
     assert infos["quad_4"]["clipped_actions"] == 4
+
+
+@pytest.mark.parametrize("kind", ["lists", "doubles", "whole numbers", "columns"])
+def test_actions_in_any_form_of_numbers_are_flown_as_those_of_the_space(kind):
+    whole = np.random.default_rng(0).integers(-1, 2, (6, 4))
+    columns = np.asfortranarray(whole.astype(np.float32))
+    rows = {"lists": columns.tolist(), "doubles": columns.astype(float), "columns": columns}
+    forms = (np.ascontiguousarray(columns), rows.get(kind, whole))
+    seen = []
+    for form in forms:
+        env = formation_v0.parallel_env(vehicles=6)
+        env.reset(seed=0)
+        seen.append(env.step(dict(zip(env.agents, form, strict=True)))[0])
+    assert all(np.array_equal(seen[0][name], seen[1][name]) for name in seen[0])

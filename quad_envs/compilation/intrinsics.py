@@ -35,14 +35,26 @@ def _write_stage(
     out[start + 3 : start + 8] = previews[row, 6:11]
 
 
-def _take_nearer(places: Array, at: int, x: float, y: float, z: float) -> None:
-    """Take the squared distances of four places to (x, y, z) into the smallest ones so far.
+def _take_nearest(places: Array, at: int, lanes: int) -> None:
+    """Take squared distances of four places from each other and all later ones into the smallest so far.
 
-    From places[at] on stand four x, four y, four z and the four squared distances.
+    From places[at] on, and again behind them, stand four x, four y, four z and the four squared distances.
+
+    Args:
+        places: Of all, (16 blocks,).
+        at: Where the four stand.
+        lanes: Of how many of them the others of the four take the distance.
     """
-    four = places[at : at + 16].reshape(4, 4)
-    square = (four[0] - x) ** 2 + (four[1] - y) ** 2 + (four[2] - z) ** 2
-    four[3] = np.minimum(square, four[3])
+    four, later = places[at : at + 16].reshape(4, 4), places[at + 16 :].reshape(-1, 4, 4)
+    apart = later[:, :3, None, :] - four[:3, :, None]
+    square = apart[:, 0] ** 2 + apart[:, 1] ** 2 + apart[:, 2] ** 2
+    later[:, 3] = np.fmin(later[:, 3], np.fmin.reduce(square, axis=1))
+    four[3] = np.fmin(four[3], np.fmin.reduce(square, axis=(0, 2), initial=np.inf))
+    for j in range(lanes):
+        x, y, z = four[:3] - four[:3, j : j + 1]
+        square = x**2 + y**2 + z**2
+        square[j] = np.inf
+        four[3] = np.fmin(four[3], square)
 
 
 def _fetch(table: Array | NDArray[np.float32], row: int, rows: int) -> None:
@@ -143,44 +155,87 @@ def _in_registers(typing: Any, out: Any, start: Any, previews: Any, row: Any, p:
     return types.void(out, types.intp, previews, types.intp, p), generate
 
 
-def _nearer_in_registers(typing: Any, places: Any, at: Any, x: Any, y: Any, z: Any) -> Any:
-    """`_take_nearer` on four doubles at once."""
+_DOUBLES, _LANE, _WORD = ir.VectorType(ir.DoubleType(), 4), ir.IntType(32), ir.IntType(64)
+
+
+def _four_from(builder: Any, data: Any, start: Any, k: int) -> Any:
+    """The address of the k-th four doubles from a place on."""
+    place = builder.add(start, ir.Constant(_WORD, 4 * k))
+    return builder.bitcast(builder.gep(data, [place]), _DOUBLES.as_pointer())
+
+
+def _squares(builder: Any, rows: list[Any], point: list[Any]) -> Any:
+    """Squared distances of a point to four others."""
+    square = None
+    for row, place in zip(rows, point, strict=True):
+        first = builder.insert_element(ir.Constant(_DOUBLES, ir.Undefined), place, ir.Constant(_LANE, 0))
+        broadcast = builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(_LANE, 4), [0] * 4))
+        apart = builder.fsub(row, broadcast)
+        part = builder.fmul(apart, apart)
+        square = part if square is None else builder.fadd(square, part)
+    return square
+
+
+def _smaller(builder: Any, x: Any, y: Any) -> Any:
+    """The smaller of each; y where x is no number."""
+    return builder.select(builder.fcmp_ordered("<", x, y), x, y)
+
+
+def _nearest_in_registers(typing: Any, places: Any, at: Any, lanes: Any) -> Any:
+    """`_take_nearest` on four doubles at once; that of two places is computed once, for both ends."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        data = context.make_array(places)(context, builder, arguments[0]).data
-        doubles, lane = ir.VectorType(ir.DoubleType(), 4), ir.IntType(32)
-
-        def row(k: int) -> Any:
-            start = builder.add(arguments[1], ir.Constant(ir.IntType(64), 4 * k))
-            return builder.bitcast(builder.gep(data, [start]), doubles.as_pointer())
-
-        square = None
-        for k, place in enumerate(arguments[2:]):
-            first = builder.insert_element(ir.Constant(doubles, ir.Undefined), place, ir.Constant(lane, 0))
-            broadcast = builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(lane, 4), [0] * 4))
-            apart = builder.fsub(builder.load(row(k), align=8), broadcast)
-            part = builder.fmul(apart, apart)
-            square = part if square is None else builder.fadd(square, part)
-        nearest = builder.load(row(3), align=8)
-        nearer = builder.fcmp_ordered("<", square, nearest)
-        builder.store(builder.select(nearer, square, nearest), row(3), align=8)
+        array = context.make_array(places)(context, builder, arguments[0])
+        own = [_four_from(builder, array.data, arguments[1], k) for k in range(4)]
+        *rows, nearest = (builder.load(place, align=8) for place in own)
+        four = [[builder.extract_element(row, ir.Constant(_LANE, j)) for row in rows] for j in range(4)]
+        infinite = ir.Constant(_DOUBLES, [float("inf")] * 4)
+        for j, point in enumerate(four):
+            far, itself = ir.Constant(ir.DoubleType(), float("inf")), ir.Constant(_LANE, j)
+            square = builder.insert_element(_squares(builder, rows, point), far, itself)
+            counts = builder.icmp_signed("<", ir.Constant(_WORD, j), arguments[2])
+            nearest = _smaller(builder, builder.select(counts, square, infinite), nearest)
+        back = [cgutils.alloca_once_value(builder, infinite) for _ in four]
+        step = ir.Constant(_WORD, 16)
+        start, stop = builder.add(arguments[1], step), cgutils.unpack_tuple(builder, array.shape)[0]
+        with cgutils.for_range_slice(builder, start, stop, step) as (later, _):
+            addresses = [_four_from(builder, array.data, later, k) for k in range(4)]
+            *others, found = (builder.load(address, align=8) for address in addresses)
+            for point, smallest in zip(four, back, strict=True):
+                square = _squares(builder, others, point)
+                builder.store(_smaller(builder, square, builder.load(smallest)), smallest)
+                found = _smaller(builder, square, found)
+            builder.store(found, addresses[3], align=8)
+        across = _smallest_of_each(builder, [builder.load(smallest) for smallest in back])
+        builder.store(_smaller(builder, across, nearest), own[3], align=8)
         return context.get_dummy_value()
 
-    return types.void(places, types.intp, types.float64, types.float64, types.float64), generate
+    return types.void(places, types.intp, types.intp), generate
+
+
+def _smallest_of_each(builder: Any, vectors: list[Any]) -> Any:
+    """The smallest entry of each of four vectors."""
+
+    def halves(x: Any, y: Any, *lanes: list[int]) -> Any:
+        kind = ir.VectorType(_LANE, 4)
+        return _smaller(builder, *(builder.shuffle_vector(x, y, ir.Constant(kind, each)) for each in lanes))
+
+    pairs = [halves(*vectors[k : k + 2], [0, 4, 2, 6], [1, 5, 3, 7]) for k in (0, 2)]
+    return halves(*pairs, [0, 1, 4, 5], [2, 3, 6, 7])
 
 
 write_stage: Any
-take_nearer: Any
+take_nearest: Any
 borrowed: Any
 fetch: Any
 bits_of: Any
 number_of: Any
 if getattr(config, "DISABLE_JIT", False):
-    take_nearer = _take_nearer
+    take_nearest = _take_nearest
     write_stage, borrowed = _write_stage, _borrowed
     bits_of, number_of, fetch = _bits_of, _number_of, _fetch
 else:
     write_stage, borrowed = intrinsic(_in_registers), intrinsic(_without_count)
-    take_nearer = intrinsic(_nearer_in_registers)
+    take_nearest = intrinsic(_nearest_in_registers)
     bits_of, number_of = intrinsic(_cast_to_bits), intrinsic(_cast_to_number)
     fetch = intrinsic(_ask_for_lines)

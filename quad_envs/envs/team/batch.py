@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...checks import array_bytes, require_memory
-from ...compilation.decorators import entry_of
+from ...compilation.decorators import DirectEntry, entry_of
 from ...compilation.packed import IntArray, pack
 from ...compilation.threads import Threads
 from ...constraints import constraint_scales
@@ -62,7 +62,7 @@ from .scores import N_LOSS
 from .told import Parts, TeamScores, parts_of, team_scores
 
 _tabulate_previews = entry_of(tabulate_previews)
-_step, _begin = entry_of(step_teams), entry_of(begin_teams)
+_step, _begin = DirectEntry(step_teams), entry_of(begin_teams)
 Generators = Sequence[np.random.Generator]
 _RESET_OPTIONS = ("state",)
 
@@ -333,8 +333,11 @@ class TeamBatch(PackedBatch):
         Raises:
             ValueError: If an action is not finite; then nobody has moved.
         """
-        step = partial(_step, self._words, actions, out, told, self._constraints)
-        bad = step(0, 0, self.teams) if self._threads is None else min(self._threads.shares(self.teams, step))
+        if self._threads is None:
+            bad: int = _step.call(self._words, actions, out, told, self._constraints, 0, 0, self.teams)
+        else:
+            step = partial(_step.call, self._words, actions, out, told, self._constraints)
+            bad = min(self._threads.shares(self.teams, step))
         if bad >= 0:
             row, entry = divmod(bad, self.task.action_size)
             raise ValueError(

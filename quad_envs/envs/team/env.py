@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -29,6 +30,8 @@ Named = dict[str, Any]
 # PettingZoo asks for finite bounds; no state of a flight within the arena comes near.
 _BOUND = 1e6
 _FIRST = np.zeros(1, dtype=np.int64)  # the batch's only team
+_FLOAT32 = np.dtype(np.float32)
+_ndim, _dtype = attrgetter("ndim"), attrgetter("dtype")
 _METADATA: dict[str, Any] = {
     "render_modes": ["human", "rgb_array"],
     "render_fps": 20,
@@ -58,7 +61,6 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
 
             self._pictures = TeamPictures(self._batch, picture_size, render_mode)
         self.possible_agents = [f"quad_{i}" for i in range(options.vehicles)]
-        self.agents: list[str] = []
         self.max_cycles = self.task.episode_steps
         self.np_random: np.random.Generator | None = None
         self._action_size = self.task.action_size
@@ -72,7 +74,7 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
         }
         state_size = sum(part.stop - part.start for part in self.state_slices.values())
         self.state_space = spaces.Box(-_BOUND, _BOUND, (state_size,), np.float64)
-        self._rows = np.arange(options.vehicles)  # rows of the agents that fly
+        self._let_fly(np.arange(0))
 
     def observation_space(self, agent: str) -> spaces.Box:
         """Of one agent; always the same object."""
@@ -142,8 +144,7 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
         self._batch.begin(_FIRST, [self.np_random], observations.reshape(-1), told, options)
         if self._pictures:
             self._pictures.record()
-        self.agents = self.possible_agents.copy()
-        self._rows = np.arange(len(self.agents))
+        self._let_fly(np.arange(len(self.possible_agents)))
         *_, infos = self._tell(self.agents, self._batch.parts(told))
         return dict(zip(self.agents, observations, strict=True)), infos
 
@@ -168,9 +169,8 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
             numbers, counts, flags, values, terms = parts
             parts = Parts(numbers[:, which], counts[:, which], flags[:, which], values[which], terms[which])
         rewards, terminated, truncated, infos = self._tell(agents, parts)
-        if True in terminated.values() or True in truncated.values():
-            self._rows = which[[not (terminated[name] or truncated[name]) for name in agents]]
-            self.agents = [self.possible_agents[i] for i in self._rows]
+        if parts.somebody_ends():
+            self._let_fly(which[[not (terminated[name] or truncated[name]) for name in agents]])
         return dict(zip(agents, observations, strict=True)), rewards, terminated, truncated, infos
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -190,12 +190,15 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
 
     def _stack(self, actions: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
         """Actions of all vehicles, (N, action_size); zero for those that left."""
-        agents = self.agents
+        agents, size = self.agents, self._action_size
         try:
-            rows = [actions[name] for name in agents]
-            fits = set(map(len, rows)) == {self._action_size} and len(actions) == len(agents)
-            joined = np.concatenate(rows, dtype=np.float32, casting="same_kind")
-        except (KeyError, TypeError, ValueError):
+            rows: Any = self._of_each(actions) if len(agents) > 1 else [actions[name] for name in agents]
+            fits = set(map(len, rows)) == {size} and len(actions) == len(agents)
+            if set(map(_ndim, rows)) == {1} and list(map(_dtype, rows)) == [_FLOAT32] * len(rows):
+                joined = np.frombuffer(b"".join(rows), dtype=np.float32)  # the quickest way for many
+            else:
+                joined = np.concatenate(rows, dtype=np.float32, casting="same_kind")
+        except (AttributeError, KeyError, TypeError, ValueError):
             fits = False
         if not fits or joined.ndim != 1:
             self._check(actions)
@@ -231,15 +234,21 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
             ):
                 raise ValueError(f"action of {name} must be {self._action_size} numbers, got {shown(action)}")
 
-    @staticmethod
+    def _let_fly(self, rows: NDArray[np.int64]) -> None:
+        """These vehicles, (n,), are the agents from now on."""
+        self._rows = rows
+        self.agents: list[str] = [self.possible_agents[i] for i in rows.tolist()]
+        self._nobody = dict.fromkeys(self.agents, False)
+        self._of_each: Any = itemgetter(*self.agents) if self.agents else None
+
     def _tell(
-        agents: list[str], parts: Parts
+        self, agents: list[str], parts: Parts
     ) -> tuple[dict[str, float], dict[str, bool], dict[str, bool], dict[str, Named]]:
         """Rewards, terminations, truncations and infos of the agents; arrays are rows of one of the team."""
         rewards, *numbers = parts.numbers.tolist()
         crashed, truncated, violated, terminated, _ = parts.flags.tolist()
         columns = *numbers, *parts.counts.tolist(), crashed, violated, parts.values, parts.terms
-        told = zip(*columns, strict=True)
+        told, ends = zip(*columns, strict=True), parts.somebody_ends()
         infos = [
             {
                 "cost": cost,
@@ -259,7 +268,7 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
         ]
         return (
             dict(zip(agents, rewards, strict=True)),
-            dict(zip(agents, terminated, strict=True)),
-            dict(zip(agents, truncated, strict=True)),
+            dict(zip(agents, terminated, strict=True)) if ends else self._nobody.copy(),
+            dict(zip(agents, truncated, strict=True)) if ends else self._nobody.copy(),
             dict(zip(agents, infos, strict=True)),
         )

@@ -190,10 +190,17 @@ def sense(
     most, found = which.shape[0], 0
     reach = team[SENSING_RADIUS] * team[SENSING_RADIUS]
     own, x, y, z = motions[i], places[0], places[1], places[2]
+    left = 0  # of those within reach, itself among them, whom the second loop has still to meet
     for j in range(squares.size):
         squares[j] = (x[j] - own[0]) ** 2 + (y[j] - own[1]) ** 2 + (z[j] - own[2]) ** 2
+        left += 0 if squares[j] >= reach else 1
     for j in range(squares.size):
-        if squares[j] >= reach or j == i:
+        if left == 0:
+            break
+        if squares[j] >= reach:
+            continue
+        left -= 1
+        if j == i:
             continue
         dx, dy, dz = x[j] - own[0], y[j] - own[1], z[j] - own[2]
         distance = math.sqrt(squares[j])

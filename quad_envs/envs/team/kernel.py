@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...compilation.decorators import Int, inline_kernel, kernel, lane_kernel
-from ...compilation.intrinsics import borrowed, take_nearer
+from ...compilation.intrinsics import borrowed, take_nearest
 from ...compilation.packed import IntArray, unpacker
 from ...dynamics import arrive, set_out
 from ...lanes import (
@@ -77,7 +77,7 @@ from .scores import N_LOSS, judge_estimate, judge_team
 PLAN_SCALE = 5.0  # m, and m/s: of the plan in an action, relative to the sender
 ESTIMATE_REACH = 20.0  # m: of an estimated position in an action, relative to the vehicle
 ESTIMATE_SPEED = 5.0  # m/s: of an estimated velocity in an action
-_POINT = 4 * LANES  # numbers of four places and their smallest squared distances, see `take_nearer`
+_POINT = 4 * LANES  # numbers of four places and their smallest squared distances, see `take_nearest`
 
 # Rows of what a step tells of n vehicles, (.., n) float64: numbers, counts as int64, flags as bytes, then the
 # constraint values, (n, number of constraints), and terms of the reward, (n, N_LOSS + number of constraints).
@@ -161,14 +161,8 @@ def _gather(blocks: Array, row: Int, n: int, places: Array) -> None:
 @kernel
 def _take_nearest(places: Array, n: int) -> None:
     """Take the squared distances between the places of n vehicles into the smallest ones so far."""
-    blocks = places.size // _POINT
-    for i in range(n):
-        x = i // LANES * _POINT + i % LANES
-        p = places[x], places[x + LANES], places[x + 2 * LANES]
-        places[x] = math.inf  # no vehicle is near itself
-        for b in range(blocks):
-            take_nearer(places, b * _POINT, p[0], p[1], p[2])
-        places[x] = p[0]
+    for b in range(places.size // _POINT):
+        take_nearest(places, b * _POINT, min(LANES, n - b * LANES))
 
 
 @inline_kernel
