@@ -1,10 +1,11 @@
-"""Writes the tables of docs/results/protocol.md from the published results of `quad-bench-2026.1`.
+"""Writes the tables of the pages that tell what `quad-bench-2026.1` found, README among them.
 
-    python docs/protocol.py          # the page anew from the numbers that are published
+    python docs/protocol.py          # the pages anew from the numbers that are published
     python docs/protocol.py RUN      # publish those of a results folder first, with its frontiers
 
-Published are `contenders.csv` of the run, as it is, and what the run says of itself. MkDocs does not read
-this file; a test holds the page to what it writes.
+Published are `contenders.csv` of the run, as it is, and what the run says of itself. docs/results/protocol.md
+has them all, docs/results/learned.md and README the best MPC beside the best network. MkDocs does not read
+this file; a test holds the pages to what it writes.
 """
 
 from __future__ import annotations
@@ -21,14 +22,27 @@ from pathlib import Path
 
 from baselines.files import write_atomic
 from baselines.report.answer import percent, rounded
+from baselines.sweeps.contenders import VIOLATING
 
 PLACE = Path(__file__).parent / "results"
 PAGE, NUMBERS, FACTS = (PLACE / name for name in ("protocol.md", "protocol.csv", "protocol.json"))
+ANSWER, README = PLACE / "learned.md", Path(__file__).parent.parent / "README.md"
 NOMINAL = "nominal"
 KEPT = ("protocol", "versions", "git_revision", "platform")  # of what a run says of itself
+# What README shows of it: environments and conditions.
+SHOWN = [
+    ("Helix", NOMINAL),
+    ("Corridor", NOMINAL),
+    ("Helix", "gusts"),
+    ("Helix", "20 % other parameters"),
+    ("Helix", "sensor noise"),
+    ("Helix", "weak rotors, far starts"),
+    ("Helix", "unseen racetrack"),
+]
 _BLOCK = re.compile(r"(<!-- tables: python docs/protocol.py -->\n).*?(<!-- end of tables -->)", re.DOTALL)
 
-Rows = Sequence[dict[str, str]]
+Row = dict[str, str]
+Rows = Sequence[Row]
 
 
 def publish(run: Path) -> None:
@@ -49,7 +63,7 @@ def publish(run: Path) -> None:
         shutil.copyfile(drawing, PLACE / drawing.name.replace(f"{NOMINAL}-", ""))
 
 
-def published() -> list[dict[str, str]]:
+def published() -> list[Row]:
     """Contenders as published, but for those that only trace the frontier."""
     with NUMBERS.open(encoding="utf-8", newline="") as file:
         return [row for row in csv.DictReader(file) if not row["trace"]]
@@ -61,7 +75,7 @@ def tables() -> str:
     return "\n".join([_origin(facts), *_sections(facts["tables"], rows)]) + "\n"
 
 
-def _origin(facts: dict[str, dict[str, str]]) -> str:
+def _origin(facts: dict[str, Row]) -> str:
     said = facts["protocol"]
     part = "all of it" if said["whole"] else "a part of it"
     return (
@@ -70,7 +84,7 @@ def _origin(facts: dict[str, dict[str, str]]) -> str:
     )
 
 
-def _sections(listed: Sequence[dict[str, str]], rows: Rows) -> Iterator[str]:
+def _sections(listed: Sequence[Row], rows: Rows) -> Iterator[str]:
     for env in dict.fromkeys(row["env"] for row in rows):
         for table in listed:
             here = [row for row in rows if row["env"] == env and row["table"] == table["label"]]
@@ -85,45 +99,45 @@ def _sections(listed: Sequence[dict[str, str]], rows: Rows) -> Iterator[str]:
                 yield f"![Score against quadratic cost, {env}, {table['label']}]({picture})\n"
 
 
-def _number(row: dict[str, str], name: str) -> float:
+def _number(row: Row, name: str) -> float:
     return float(row.get(name) or math.nan)
 
 
-def _rank(row: dict[str, str]) -> float:
+def _rank(row: Row) -> float:
     return -_number(row, "score")
 
 
-def _spread(name: str) -> Callable[[dict[str, str]], str]:
+def _spread(name: str) -> Callable[[Row], str]:
     """A mean with the half width of its interval."""
 
-    def cell(row: dict[str, str]) -> str:
+    def cell(row: Row) -> str:
         value, low, high = (_number(row, name + end) for end in ("", "_low", "_high"))
         return rounded(value, 0.5 * (high - low)) if math.isfinite(value) else ""
 
     return cell
 
 
-def _plain(name: str, said: str) -> Callable[[dict[str, str]], str]:
-    def cell(row: dict[str, str]) -> str:
+def _plain(name: str, said: str) -> Callable[[Row], str]:
+    def cell(row: Row) -> str:
         value = _number(row, name)
         return format(value, said) if math.isfinite(value) else ""
 
     return cell
 
 
-def _policy(row: dict[str, str]) -> str:
+def _policy(row: Row) -> str:
     return f"`{row['policy']}`"
 
 
-def _minus(row: dict[str, str]) -> str:
+def _minus(row: Row) -> str:
     return "" if row["policy"] == row["base"] else _spread("score_minus_base")(row)
 
 
-def _crashes(row: dict[str, str]) -> str:
+def _crashes(row: Row) -> str:
     return f"{_number(row, 'crashed'):.0f} of {row['flights']}"
 
 
-_NUMBERS: dict[str, Callable[[dict[str, str]], str]] = {
+_NUMBERS: dict[str, Callable[[Row], str]] = {
     "policy": _policy,
     "score": _spread("score"),
     "minus the best MPC": _minus,
@@ -138,7 +152,7 @@ _NUMBERS: dict[str, Callable[[dict[str, str]], str]] = {
 }
 
 
-def _markdown(columns: dict[str, Callable[[dict[str, str]], str]], rows: Rows) -> str:
+def _markdown(columns: dict[str, Callable[[Row], str]], rows: Rows) -> str:
     """A table; columns in which nobody has a number are left out."""
     cells = {name: [cell(row) for row in rows] for name, cell in columns.items()}
     said = {name: column for name, column in cells.items() if any(column)}
@@ -155,7 +169,7 @@ def _conditions(rows: Rows) -> str:
     flown = {(row["policy"], row["condition"]): row for row in rows}
     best = {name: min(_rank(row) for row in rows if row["condition"] == name) for name in found}
 
-    def cell(condition: str, of: dict[str, str]) -> str:
+    def cell(condition: str, of: Row) -> str:
         row = flown.get((of["policy"], condition))
         return "" if row is None else _score(row, _rank(row) == best[condition])
 
@@ -163,22 +177,88 @@ def _conditions(rows: Rows) -> str:
     return _markdown({"score": _policy} | {name: partial(cell, name) for name in found}, plain)
 
 
-def _score(row: dict[str, str], best: bool) -> str:
+def _score(row: Row, best: bool) -> str:
     """A score, in bold if it is the best, with the crashes and violations there were."""
     score, violating = f"{_number(row, 'score'):.3f}", _number(row, "violation_share")
     notes = [f"{_crashes(row)} crash"] * (_number(row, "crashed") > 0.0)
-    notes += [f"{percent(violating)} violating"] * (violating > 0.01)
+    notes += [f"{percent(violating)} violating"] * (violating > VIOLATING)
     score = f"**{score}**" if best else score
     return f"{score} ({', '.join(notes)})" if notes else score
 
 
-def renewed() -> str:
-    """The text of the page with today's tables."""
-    return _BLOCK.sub(lambda match: match[1] + tables() + match[2], PAGE.read_text(encoding="utf-8"))
+def _judged(row: Row) -> tuple[float, ...]:
+    """Less is better: crashes, then violations above the share allowed, then the score."""
+    crashed = _number(row, "crashed") / float(row["flights"])
+    return crashed, max(0.0, _number(row, "violation_share") - VIOLATING), _rank(row)
+
+
+def _is_mpc(row: Row) -> bool:
+    return row["mpc"] == "True"
+
+
+def _is_network(row: Row) -> bool:
+    return bool(row["kind"]) and row["kind"] not in ("controller", "tuned", "outside")
+
+
+_SIDES = {"best MPC": _is_mpc, "best network": _is_network}
+
+
+def sides(cells: Sequence[tuple[str, str]], paired: bool) -> str:
+    """The best MPC beside the best network in each table, as Markdown.
+
+    Args:
+        cells: Environments and conditions, one row each; those that nobody has flown are left out.
+        paired: Whether to say the difference, from the same starts.
+    """
+    rows = published()
+    labels = [label for label in dict.fromkeys(row["table"] for row in rows) if label != "teams"]
+    lines = []
+    for env, condition in cells:
+        here = [row for row in rows if (row["env"], row["condition"]) == (env, condition)]
+        if here:
+            found = [cell for label in labels for cell in _beside(here, label, paired)]
+            lines.append("| " + " | ".join([f"{env}, {condition}", *found]) + " |")
+    head = ["", *[f"{label}: {side}" for label in labels for side in _SIDES]]
+    return "\n".join(["| " + " | ".join(head) + " |", "|---" * len(head) + "|", *lines]) + "\n"
+
+
+def _beside(rows: Rows, label: str, paired: bool) -> Iterator[str]:
+    """Cells of the best of each side of a table."""
+    best = {}
+    for side, belongs in _SIDES.items():
+        found = sorted((row for row in rows if row["table"] == label and belongs(row)), key=_judged)
+        best[side] = found[0] if found else None
+    leads = min((row for row in best.values() if row), key=_judged, default=None)
+    for row in best.values():
+        if row is None:
+            yield ""
+            continue
+        minus = f"; {_minus(row)}" if paired and row["mpc"] != "True" and _minus(row) else ""
+        yield f"{_policy(row)} {_score(row, row is leads)}{minus}"
+
+
+def _all_cells() -> list[tuple[str, str]]:
+    return list(
+        dict.fromkeys((row["env"], row["condition"]) for row in published() if row["table"] != "teams")
+    )
+
+
+PAGES = {
+    PAGE: tables,
+    ANSWER: lambda: sides(_all_cells(), paired=True),
+    README: lambda: sides(SHOWN, paired=False),
+}
+
+
+def renewed(page: Path) -> str:
+    """The text of one of PAGES with today's tables."""
+    made = PAGES[page]()
+    return _BLOCK.sub(lambda match: match[1] + made + match[2], page.read_text(encoding="utf-8"))
 
 
 if __name__ == "__main__":
     if sys.argv[1:]:
         publish(Path(sys.argv[1]))
-    PAGE.write_text(renewed(), encoding="utf-8")
-    print(PAGE)
+    for page in PAGES:
+        page.write_text(renewed(page), encoding="utf-8")
+        print(page)
