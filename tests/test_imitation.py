@@ -17,7 +17,7 @@ from quad_envs.encoding import hover_actions
 from quad_envs.observations.features import default_features
 
 HELIX, RANDOM, FORMATION = "quad/HelixTracking-v0", "quad/RandomTracking-v0", "quad/Formation-v0"
-TARGET = "quad/TargetTracking-v0"
+TARGET, CORRIDOR = "quad/TargetTracking-v0", "quad/CorridorTracking-v0"
 
 
 def still(task, outputs=4):
@@ -99,6 +99,20 @@ def test_an_expert_keeps_the_distance_that_it_is_told():
     rows = np.stack(list(observations.values()))
     near, far = (expert.predict(rows)[0] for expert in experts)
     assert np.abs(near - far).max() > 0.05
+
+
+def test_an_expert_has_the_options_that_it_is_given():
+    task = task_of(HELIX)
+    rows = flights_of(HELIX, "hover", 8)._observations
+    plain = make_expert("nmpc", task).predict(rows)[0]
+    assert np.abs(make_expert("nmpc", task, options={"R": 0.01}).predict(rows)[0] - plain).max() > 0.01
+    with pytest.raises(ValueError, match="did you mean 'margin'"):
+        hyper = {"expert": "nmpc", "expert_options": {"magrin": 0.2}}
+        train(CORRIDOR, "dagger", hyper=hyper, steps=1)
+    with pytest.raises(
+        ValueError, match=r"expert_options of 'dagger' must be a mapping from names to values"
+    ):
+        train(CORRIDOR, "dagger", hyper={"expert_options": 0.2}, steps=1)
 
 
 @pytest.mark.parametrize(("env_id", "separation"), [(HELIX, 0.5), (FORMATION, 0.3)])

@@ -112,9 +112,10 @@ def test_what_is_tuned_follows_from_the_options_and_the_task():
     assert make_search("nmpc", helix, {}, ["horizon"]).options(np.array([-1.0])) == {"horizon": 2}
 
 
+@pytest.mark.parametrize("env_id", [HELIX, "quad/CorridorTracking-v0"])
 @pytest.mark.parametrize("name", KNOBS)
-def test_every_point_of_a_search_is_an_option_that_is_allowed(name):
-    task, rng = task_of(HELIX), np.random.default_rng(0)
+def test_every_point_of_a_search_is_an_option_that_is_allowed(name, env_id):
+    task, rng = task_of(env_id), np.random.default_rng(0)
     search = make_search("nmpc", task, {"objective": "score", "reject_disturbance": True}, [name])
     for z in rng.uniform(-3.0, 3.0, (20, search.size)):
         NmpcOptions(**search.options(z))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
@@ -69,6 +70,7 @@ class DaggerOptions:
     """Hyperparameters of DAgger."""
 
     expert: str = ""  # a policy, or a trained one; empty: sdc-nmpc, consensus-mpc or cooperative-mpc
+    expert_options: Mapping[str, Any] | None = None  # of the expert, as `make_policy` takes them
     n_envs: int = 64  # flights at once, or vehicles of all teams
     n_steps: int = 20  # of each of them between fits
     expert_flies: float = 0.2  # share of the budget in which those that the expert flies fall to none

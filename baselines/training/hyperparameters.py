@@ -99,6 +99,13 @@ def _checked(kind: type[Any], algorithm: str, name: str, value: Any, source: str
         shows = f"({source}; quad-envs list {algorithm} shows what each is)"
         raise ValueError(f"{_unknown(algorithm, name, known)} {shows}")
     default = known[name].default
+    if "Mapping" in str(known[name].type):
+        if not (value is None or isinstance(value, Mapping)):
+            raise ValueError(
+                f"hyperparameter {name} of {algorithm!r} must be a mapping from names to values, got "
+                f"{shown(value)} ({source})"
+            )
+        return value
     if default is MISSING or default is None or value is None:
         if not (value is None or is_number(value) or isinstance(value, str | list | tuple)):
             raise ValueError(

@@ -7,7 +7,7 @@ observation shows cannot be imitated by a network that remembers nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -138,7 +138,11 @@ class Labels:
 
 
 def make_expert(
-    name: str, task: BaseTask, separation: float | None = None, reject_disturbance: bool = False
+    name: str,
+    task: BaseTask,
+    separation: float | None = None,
+    reject_disturbance: bool = False,
+    options: Mapping[str, Any] | None = None,
 ) -> Policy:
     """The policy to imitate.
 
@@ -148,9 +152,11 @@ def make_expert(
         separation: Distance that it keeps, m: what imitates it is less exact, and between the task's
             separation and a crash are 7 cm. None for the task's own.
         reject_disturbance: Whether an MPC estimates and rejects disturbances, for who sees the estimate.
+        options: Of the policy, which come before these.
 
     Raises:
-        ValueError: If it is unknown, sees more than observations, or remembers what a network cannot.
+        ValueError: If it is unknown, has no such option, sees more than observations, or remembers what a
+            network cannot.
     """
     mission = task.mission
     if not name and mission not in _EXPERTS:
@@ -166,12 +172,19 @@ def make_expert(
         task = replace(task, separation=separation)
     name = name or _EXPERTS[mission]
     rejects = reject_disturbance and not is_trained(name) and "reject_disturbance" in policy_options(name)
-    expert = make_policy(name, task, **({"reject_disturbance": True} if rejects else {}))
+    given = {"reject_disturbance": True} if rejects else {}
+    expert = make_policy(name, task, **given | dict(options or {}))
     if is_privileged(expert):
         raise ValueError(
             f"expert {name!r} decides from the whole truth, a network from observations; choose another"
         )
     return expert
+
+
+def _expert_of(task: BaseTask, options: DaggerOptions) -> Policy:
+    return make_expert(
+        options.expert, task, options.separation, options.disturbance_estimate, options.expert_options
+    )
 
 
 def check(
@@ -184,7 +197,7 @@ def check(
             training cannot go on from `start`.
     """
     task = task_options.task
-    make_expert(options.expert, task, options.separation, options.disturbance_estimate)
+    _expert_of(task, options)
     if isinstance(task_options, TeamOptions):
         require_measured(task_options)
     elif options.episode_steps is not None:
@@ -221,7 +234,7 @@ def train(
     import torch
 
     torch.manual_seed(seed)
-    expert = make_expert(options.expert, task_options.task, options.separation, options.disturbance_estimate)
+    expert = _expert_of(task_options.task, options)
     check(task_options, options)
     if isinstance(task_options, TeamOptions) and options.episode_steps is not None:
         task_options = replace(task_options, max_cycles=options.episode_steps)

@@ -18,6 +18,7 @@ from ..policies.registry import options_type, policy_options
 AnyTask = Task | TeamTask
 # Entries of the state that share a factor: x and y, as frame "heading" needs them, and their kin.
 _GROUPS = ((0, 1), (2,), (3, 4), (5,), (6, 7), (8,), (9, 10), (11,))
+_MOST_MARGIN = 0.9  # of half the distance between the narrowest limits
 _MOST = 3.0  # decades that a number may go from where it began
 
 
@@ -57,6 +58,12 @@ def _change_weight(z: Array, task: AnyTask, default: Any) -> float:
     return float(10.0 ** (z[0] - 2.0) if default is None else default * 10.0 ** z[0])
 
 
+def _margin(z: Array, task: AnyTask, default: Any) -> float:
+    """Less than what leaves nothing between the narrowest limits of the state."""
+    lower, upper = task.limits.state_box()
+    return min(_positive(z, task, default), _MOST_MARGIN * float(np.min(upper - lower)) / 2.0)
+
+
 def _follows_noise(task: AnyTask, options: Mapping[str, Any]) -> bool:
     """Whether a disturbance estimator takes its gain from the noise of the sensors."""
     return bool(options["reject_disturbance"]) and options["estimator_gain"] == "auto"
@@ -76,7 +83,7 @@ KNOBS: dict[str, Knob] = {
     "R": Knob(1, _input_weight),
     "R_rate": Knob(1, _change_weight),
     "terminal": Knob(1, _positive),
-    "margin": Knob(1, _positive, lambda task, options: len(task.constraint_names) > 0),
+    "margin": Knob(1, _margin, lambda task, options: len(task.constraint_names) > 0),
     # The gain itself where the caller gives a number; one that follows the noise of the sensors goes on to.
     "estimator_gain": Knob(1, _share, _own_gain),
     "estimator_gain_scale": Knob(1, _positive, _follows_noise),
