@@ -17,6 +17,7 @@ EXAMPLES = {
     "sb3_tools": (["stable_baselines3"], ["--steps", "2000"], "lmpc: score 0."),
     "supersuit_sb3": (["supersuit", "stable_baselines3"], ["--steps", "1536"], "consensus-mpc: score 0."),
     "torchrl_ppo": (["torchrl"], ["--updates", "1"], "update 1: mean reward 0."),
+    "torchrl_mappo": (["torchrl"], ["--seconds", "1"], "consensus-mpc: score 0."),
     "rllib_formation": (["ray.rllib"], ["--iterations", "1", "--batch", "1000"], "1000 steps, score 0."),
     "behaviour_cloning": (["minari", "h5py", "torch"], ["--record", "1", "--epochs", "1"], "crashes "),
     "gallery": ([], ["--only", "quad/Regulation-v0", "--out", "{tmp}"], "regulation.png, "),
