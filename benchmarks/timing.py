@@ -9,6 +9,9 @@ from time import perf_counter
 
 import numpy as np
 
+_TURN = 0.001  # s, about as long as a turn of a candidate takes: less than a scheduler gives
+_FEWEST = 7  # turns, however long they take
+
 
 def one_thread() -> None:
     """Keep numerical libraries to one thread and this process to one core; call before importing them."""
@@ -23,22 +26,26 @@ def rates(candidates: Mapping[str, tuple[Callable[[], object], int]], seconds: f
 
     Args:
         candidates: Name -> (call, units of work it does).
-        seconds: Time for each candidate, spread over repetitions that alternate between the candidates.
+        seconds: Time for each candidate, spread over short turns that alternate between the candidates: a
+            shared core is free for some of them.
     """
-    repetitions = 7
-    best = dict.fromkeys(candidates, 0.0)
+    best, spent = dict.fromkeys(candidates, 0.0), dict.fromkeys(candidates, 0.0)
     calls = {}
     for name, (call, _) in candidates.items():
         call()  # compile and warm up
         begin = perf_counter()
         call()
-        calls[name] = max(1, int(seconds / repetitions / max(perf_counter() - begin, 1e-9)))
-    for _ in range(repetitions):
+        calls[name] = max(1, int(_TURN / max(perf_counter() - begin, 1e-9)))
+    for turn in range(max(_FEWEST, int(seconds / _TURN))):
         for name, (call, units) in candidates.items():
+            if turn >= _FEWEST and spent[name] >= seconds:
+                continue
             begin = perf_counter()
             for _ in range(calls[name]):
                 call()
-            best[name] = max(best[name], units * calls[name] / (perf_counter() - begin))
+            taken = perf_counter() - begin
+            spent[name] += taken
+            best[name] = max(best[name], units * calls[name] / taken)
     return best
 
 

@@ -25,11 +25,13 @@ if TYPE_CHECKING:
     from ..pictures import TrackingPictures
 
 Observation = NDArray[np.float32]
+_Step = tuple[Observation, float, bool, bool, dict[str, Any]]
 
 # What the kernel tells of a single flight, see `kernel.N_TOLD`: reward, stage cost, cost, episode cost;
 # clipped actions, cause; crashed, truncated, violated.
 _unpack = Struct("4d2q3?5x").unpack_from
 _ONE = np.zeros(1, dtype=np.int64)
+_FLOAT32 = np.dtype(np.float32)
 
 
 class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -160,20 +162,20 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
         self._batch.begin(_ONE, [self.np_random], observation, self._told, states)
         if self._pictures:
             self._pictures.record()
-        return observation, self._answer()[-1]
+        return observation, self._answer(observation)[-1]
 
-    def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[np.float32]) -> _Step:
         """Hold the rotor commands over one control period."""
         if self._np_random is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        actions = np.ascontiguousarray(action, np.float32)
+        actions = np.ascontiguousarray(action, _FLOAT32)
         if actions.shape != (4,):
             raise ValueError(f"action must have shape (4,), one entry per rotor, got {actions.shape}")
-        observation = np.empty(self._size, np.float32)
+        observation = np.empty(self._size, _FLOAT32)
         self._batch.step(actions, observation, self._told)
         if self._pictures:
             self._pictures.record()
-        return (observation, *self._answer())
+        return self._answer(observation)
 
     def render(self) -> NDArray[np.uint8] | None:
         """The picture of the present moment, (height, width, 3), with `render_mode="rgb_array"`."""
@@ -182,17 +184,18 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
             return None
         return self._pictures.frame()
 
-    def _answer(self) -> tuple[float, bool, bool, dict[str, Any]]:
-        """Reward, terminated, truncated and info of what the kernel told."""
+    def _answer(self, observation: Observation) -> _Step:
+        """What a step returns, from what the kernel told."""
         reward, loss, cost, total, clipped, cause, crashed, truncated, violated = _unpack(self._memory)
+        values = self._values
         info = {
             "cost": cost,
             "episode_cost": total,
             "constraint_violation": violated,
-            "constraint_values": self._values.copy(),
+            "constraint_values": values.copy() if values.size else values,  # nobody can change no numbers
             "stage_cost": loss,
             "crashed": crashed,
             "crash_cause": cause,
             "clipped_actions": clipped,
         }
-        return reward, crashed, truncated, info
+        return observation, reward, crashed, truncated, info

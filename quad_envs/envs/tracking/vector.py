@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 Observations = NDArray[np.float32]
 Bools = NDArray[np.bool_]
+_FLOAT32 = np.dtype(np.float32)
 _Step = tuple[Observations, Array, Bools, Bools, dict[str, Any]]
 
 
@@ -138,7 +139,7 @@ class TrackingVectorEnv(
 
     def step(self, actions: NDArray[np.float32]) -> _Step:
         """Hold the rotor commands of all flights over one control period."""
-        actions = np.ascontiguousarray(actions, dtype=np.float32)
+        actions = np.ascontiguousarray(actions, _FLOAT32)
         if actions.shape != (self.num_envs, 4):
             raise ValueError(f"actions must have shape ({self.num_envs}, 4), got {actions.shape}")
         if not self._generators:
@@ -203,4 +204,4 @@ class TrackingVectorEnv(
         return fresh
 
     def _fresh_observations(self) -> Observations:
-        return np.empty(self._shape, np.float32)
+        return np.empty(self._shape, _FLOAT32)
