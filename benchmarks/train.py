@@ -28,8 +28,8 @@ from stable_baselines3 import PPO  # noqa: E402
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv  # noqa: E402
 
 from baselines.evaluation.table import format_table  # noqa: E402
+from baselines.policies.tanh import tanh_in_place  # noqa: E402
 from baselines.training.sb3 import PpoOptions, make_flights, make_ppo  # noqa: E402
-from baselines.training.tanh import tanh_in_place  # noqa: E402
 from quad_envs.envs.tracking.options import TrackingOptions  # noqa: E402
 from quad_envs.registration import TRACKING  # noqa: E402
 

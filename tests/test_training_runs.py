@@ -72,8 +72,9 @@ def test_the_recorded_score_is_that_of_its_starts(tmp_path):
 
     env = gymnasium.make_vec(HELIX, num_envs=starts["flights"], **SHORT)
     found = evaluate(policy, env, starts["flights"], starts["seed"])
-    # One network, sums in float32 in another order for another number of rows.
-    assert found.summary()["score"].mean == pytest.approx(result.best.score, rel=1e-5)
+    assert found.summary()["score"].mean == pytest.approx(
+        result.best.score, rel=1e-12
+    )  # another sum of scores
     assert starts["seed"] == CHOOSING
 
 

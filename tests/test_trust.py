@@ -33,7 +33,7 @@ from quad_envs import cooperative_estimation_v0, formation_v0
 HELIX = "quad/HelixTracking-v0"
 
 
-@pytest.mark.parametrize("rows", [1, 4, 9])  # up to four are decided by a kernel
+@pytest.mark.parametrize("rows", [1, 4, 9])
 def test_an_observation_beyond_what_a_network_holds_is_refused_by_its_row(rows):
     env = gym.make("quad/CorridorTracking-v0")
     network = replace(make_policy("apg-corridor", env).network, activation="relu")  # inf, then inf - inf
@@ -126,6 +126,7 @@ def test_a_cell_with_a_word_for_a_number_is_refused_by_name(folder, name, value)
         (observations.observations, 50),
         (malformed.malformed, 40),
         (repeat.repeat, 5),
+        (repeat.rows, 2),
     ],
 )
 def test_a_little_of_each_figure_fails_nowhere(tries, number):

@@ -17,7 +17,7 @@ from .protocol import Policy
 
 _STEPS = 12  # of each flight
 _ROWS = 3  # flights, from different seeds
-_BATCH_TOLERANCE = 1e-5  # a network's matrix products round differently for another number of rows
+_BATCH_TOLERANCE = 1e-5  # matrix products of torch and numpy round differently for another number of rows
 
 Flights = NDArray[Any]  # (steps, rows, d), observations
 

@@ -1,6 +1,7 @@
 """Networks as values: what they see of an observation, their layers, what their outputs command.
 
-Inference is numpy alone, so that a shipped policy needs no torch. Training frameworks export to `Network`.
+Inference is a compiled kernel, so that a shipped policy needs no torch. Training frameworks export to
+`Network`.
 """
 
 from __future__ import annotations
@@ -13,14 +14,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_envs.compilation.decorators import entry_of
-from quad_envs.encoding import Encoding, hover_actions, hover_gains
+from quad_envs.compilation.tiles import STRIP, packed
+from quad_envs.encoding import Encoding, hover_gains
 from quad_envs.names import shown
 from quad_envs.observations.features import Features
 from quad_envs.observations.heading import HeadingAxes
 from quad_envs.parameters import Array
 from quad_envs.tasks import BaseTask, Task, TeamTask
 
-from .network_kernels import forward_rows
+from .network_kernels import BLOCK, forward_rows
 from .protocol import Actions, PolicyState
 from .rows import as_rows, as_starts, not_finite, require_finite, state_of, too_large
 
@@ -29,7 +31,6 @@ Squash = Literal["tanh", "clip"]
 Activation = Literal["tanh", "relu"]
 Commands = Literal["hover", "action"]
 
-_FEW = 4  # rows up to which the compiled form is faster
 _LARGEST_SEEN = 1e6  # SI, of an observation for which layers must not overflow
 _forward = entry_of(forward_rows)
 
@@ -159,9 +160,10 @@ class NetworkPolicy:
         self._size = task.layout.size
         self._columns = network.features.columns(task.layout)
         self._axes = HeadingAxes(task.layout) if network.features.heading_axes else None
-        self._layers = network.layers()
-        self._sizes = np.array([len(self._columns), *(len(b) for _, b in self._layers)], dtype=np.int64)
-        self._flat = np.concatenate([part.reshape(-1) for layer in self._layers for part in layer])
+        layers = network.layers()
+        self._sizes = np.array([len(self._columns), *(len(b) for _, b in layers)], dtype=np.int64)
+        self._width = -(-int(self._sizes.max()) // STRIP) * STRIP
+        self._weights = np.concatenate([packed(W, b) for W, b in layers])
         self._scaling = _scaling(network.features)
         self._kinds = np.array([network.activation == "relu", network.squash == "tanh"])
         hover = network.commands == "hover"
@@ -180,8 +182,7 @@ class NetworkPolicy:
     ) -> tuple[Actions, PolicyState]:
         """Choose actions; see `Policy`.
 
-        Up to four rows are summed in another order than more, and matrix products round by their size: the
-        action of a row differs by up to 1e-6 with the number of rows beside it.
+        A row gets the same action, to the last bit, whatever rows are beside it.
 
         Raises:
             ValueError: If a shape is wrong, or an observation is not finite or so large that the answer is no
@@ -195,41 +196,15 @@ class NetworkPolicy:
         if self._axes is not None:
             require_finite(obs, self.task.layout.slices)
             obs = self._axes.turn(obs)
-        actions = self._few(obs) if n <= _FEW else self._many(obs)
-        return actions[0] if one else actions, kept
-
-    def _few(self, obs: Floats) -> Actions:
-        """Without the cost of calling numpy."""
-        out = np.empty((len(obs), self._sizes[-1]), dtype=np.float32)
-        work = np.empty((2, self._sizes.max()), dtype=np.float32)
-        layers = self._sizes, self._flat, self._kinds
-        bad = _forward(obs, self._columns, self._scaling, *layers, self._gains, work, out)
+        actions = np.empty((n, self.network.outputs), dtype=np.float32)
+        work = np.empty((2, min(n, BLOCK), self._width), dtype=np.float32)
+        layers = self._sizes, self._weights, self._kinds
+        bad = _forward(obs, self._columns, self._scaling, *layers, self._gains, work, actions)
         if bad >= 0:
             raise not_finite(obs, bad, self.task.layout.slices)
         if bad < -1:
             raise too_large(obs, -2 - bad, self.task.layout.slices)
-        return out
-
-    def _many(self, obs: Floats) -> Actions:
-        """The same in numpy."""
-        require_finite(obs, self.task.layout.slices)
-        x = obs[:, self._columns]
-        if len(self._scaling):
-            mean, scale, clip = self._scaling
-            x = np.clip((x - mean) / scale, -clip, clip).astype(np.float32)
-        with np.errstate(over="ignore", invalid="ignore"):  # what is too large is said below
-            for k, (W, b) in enumerate(self._layers):
-                x = x @ W
-                x += b
-                if k + 1 < len(self._layers) and self.network.activation == "relu":
-                    np.maximum(x, 0.0, out=x)
-                elif k + 1 < len(self._layers) or self.network.squash == "tanh":
-                    np.tanh(x, out=x)
-        if np.isnan(x).any():
-            raise too_large(obs, int(np.argmax(np.isnan(x).any(axis=1))), self.task.layout.slices)
-        np.clip(x, -1.0, 1.0, out=x)
-        hover = self.network.commands == "hover"
-        return hover_actions(x, self.task, self.network.command_range) if hover else x
+        return actions[0] if one else actions, kept
 
 
 def _scaling(features: Features) -> Array:

@@ -1,22 +1,32 @@
-"""A network for a few rows at a time, compiled: one decision in a control loop takes a few microseconds.
+"""A network for rows of observations, compiled: what a row gets does not depend on the rows beside it.
 
-For many rows numpy's matrix products are faster; `NetworkPolicy` has them, and the tests compare both.
+Sums run over the inputs in their order, in the tiles of `quad_envs.compilation.tiles`, for one row as for a
+thousand. The tests have the same in numpy.
 """
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quad_envs.compilation.decorators import inline_kernel, kernel
+from quad_envs.compilation.tiles import (
+    STRIP,
+    TILE_ROWS,
+    WIDE,
+    multiply_row,
+    multiply_row_wide,
+    multiply_rows,
+)
 from quad_envs.parameters import Array
 
 from .rows import first_not_finite
+from .tanh import tanh_in_place
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
+
+BLOCK = 64  # rows that go through all layers together, a multiple of a tile's
 
 
 @inline_kernel
@@ -29,6 +39,55 @@ def see(observation: Floats, columns: Ints, scaling: Array, out: Floats) -> None
     for k in range(columns.size):
         value = (observation[columns[k]] - scaling[0, k]) / scaling[1, k]
         out[k] = min(max(value, -scaling[2, k]), scaling[2, k])
+
+
+@inline_kernel
+def multiply(x: Floats, rows: int, width: int, n: int, weights: Floats, at: int, m: int, out: Floats) -> None:
+    """A linear layer.
+
+    Args:
+        x: Inputs of rows, flat.
+        rows: Their number.
+        width: From row to row, of x and of out.
+        n: Number of inputs.
+        weights: Of all layers.
+        at: Where those of this one begin, as `tiles.packed` gives them.
+        m: Number of outputs, a multiple of STRIP.
+        out: Result, flat.
+    """
+    tiled = rows - rows % TILE_ROWS
+    for j in range(0, m, STRIP):  # whose weights stay in the cache
+        for r in range(0, tiled, TILE_ROWS):
+            multiply_rows(x, r * width, width, n, weights, at + j * (n + 1), out, r * width + j)
+    wide = m - m % WIDE
+    for r in range(tiled, rows):
+        for j in range(0, wide, WIDE):
+            multiply_row_wide(x, r * width, width, n, weights, at + j * (n + 1), out, r * width + j)
+        for j in range(wide, m, STRIP):
+            multiply_row(x, r * width, width, n, weights, at + j * (n + 1), out, r * width + j)
+
+
+@inline_kernel
+def activate(y: Floats, relu: bool) -> None:
+    """Relu or tanh of outputs in their place; what is not a number stays so."""
+    if not relu:
+        tanh_in_place(y)
+        return
+    for j in range(y.size):
+        y[j] = np.float32(0.0) if y[j] < 0.0 else y[j]
+
+
+@inline_kernel
+def act(y: Floats, gains: Floats, out: Floats) -> bool:
+    """Write the action of a network's outputs; False if one of them is no number."""
+    for j in range(out.size):
+        if y[j] != y[j]:
+            return False
+        answer = min(max(y[j], np.float32(-1.0)), np.float32(1.0))
+        if j < 4:
+            answer = min(answer * gains[0 if answer < 0.0 else 1, j], np.float32(1.0))
+        out[j] = answer
+    return True
 
 
 @kernel
@@ -51,44 +110,36 @@ def forward_rows(
         scaling: Rows mean, scale, clip, (3, sizes[0]): an entry is (value - mean) / scale, within +-clip; or
             (0, 0), where the first layer scales.
         sizes: Inputs and outputs of each layer, (layers + 1,).
-        weights: Row by row the weights of a layer, then its biases, layer after layer.
+        weights: `tiles.packed` of each layer, layer after layer.
         kinds: Whether layers but the last are relu and not tanh; whether the outputs pass a tanh before they
             are clipped to [-1, 1], (2,).
         gains: Slopes of the actions by the first four outputs, below zero and above, `hover_gains`, (2, 4).
-        work: Scratch, (2, max(sizes)).
+        work: Scratch, (2, min(n, BLOCK), width), the width a multiple of STRIP no smaller than a size.
         out: Result, (n, sizes[-1]).
 
     Returns:
         -1; the flat index of the first entry that is not finite, seen or not; -2 - r if row r has no answer.
     """
-    layers = sizes.size - 1
-    relu, tanh_last = kinds[0], kinds[1]
-    for r in range(observations.shape[0]):
+    count, d = observations.shape
+    for r in range(count):
         bad = first_not_finite(observations[r])
         if bad >= 0:
-            return int(r * observations.shape[1] + bad)
-        see(observations[r], columns, scaling, work[0])
+            return int(r * d + bad)
+    layers, width = sizes.size - 1, work.shape[2]
+    for begin in range(0, count, BLOCK):
+        rows = min(BLOCK, count - begin)
+        for r in range(rows):
+            see(observations[begin + r], columns, scaling, work[0, r])
         at = 0
         for layer in range(layers):
-            n, m = sizes[layer], sizes[layer + 1]
-            x, y = work[layer % 2], work[(layer + 1) % 2]
-            for j in range(m):
-                y[j] = weights[at + n * m + j]
-            for i in range(n):
-                for j in range(m):
-                    y[j] += x[i] * weights[at + i * m + j]
-            if layer + 1 < layers and relu:
-                for j in range(m):
-                    y[j] = max(y[j], np.float32(0.0))
-            elif layer + 1 < layers or tanh_last:
-                for j in range(m):
-                    y[j] = math.tanh(y[j])
+            x, y = work[layer % 2].reshape(-1), work[(layer + 1) % 2].reshape(-1)
+            n, m = sizes[layer], -(-sizes[layer + 1] // STRIP) * STRIP
+            multiply(x, rows, width, n, weights, at, m, y)
+            if layer + 1 < layers or kinds[1]:
+                for r in range(rows):
+                    activate(y[r * width : r * width + m], kinds[0] and layer + 1 < layers)
             at += (n + 1) * m
-        for j in range(sizes[layers]):
-            if work[layers % 2, j] != work[layers % 2, j]:
-                return -2 - r
-            answer = min(max(work[layers % 2, j], np.float32(-1.0)), np.float32(1.0))
-            if j < 4:
-                answer = min(answer * gains[0 if answer < 0.0 else 1, j], np.float32(1.0))
-            out[r, j] = answer
+        for r in range(rows):
+            if not act(work[layers % 2, r], gains, out[begin + r]):
+                return -2 - (begin + r)
     return -1

@@ -156,7 +156,7 @@ def _blocks(rng: random.Random, policies: tuple[str, ...] = _CONTROLLERS) -> str
 
 
 def rows(seed: int) -> Iterator[Found]:
-    """Flights of networks among 6 and among 2, without end: matrix products round by the number of rows."""
+    """Flights of networks among 6 and among 2, without end."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for k in count():
