@@ -211,7 +211,7 @@ def sides(cells: Sequence[tuple[str, str]], paired: bool) -> str:
         paired: Whether to say the difference, from the same starts.
     """
     rows = published()
-    labels = [label for label in dict.fromkeys(row["table"] for row in rows) if label != "teams"]
+    labels = [label for label in dict.fromkeys(row["table"] for row in rows) if not _of_teams(label)]
     lines = []
     for env, condition in cells:
         here = [row for row in rows if (row["env"], row["condition"]) == (env, condition)]
@@ -237,10 +237,13 @@ def _beside(rows: Rows, label: str, paired: bool) -> Iterator[str]:
         yield f"{_policy(row)} {_score(row, row is leads)}{minus}"
 
 
+def _of_teams(label: str) -> bool:
+    return label.startswith("teams")
+
+
 def _all_cells() -> list[tuple[str, str]]:
-    return list(
-        dict.fromkeys((row["env"], row["condition"]) for row in published() if row["table"] != "teams")
-    )
+    told = [row for row in published() if not _of_teams(row["table"])]
+    return list(dict.fromkeys((row["env"], row["condition"]) for row in told))
 
 
 PAGES = {
