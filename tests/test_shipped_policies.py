@@ -32,6 +32,7 @@ def test_a_shipped_policy_is_small_and_says_what_made_it(name):
 
 def test_a_policy_for_several_tasks_stands_for_none_of_them():
     assert shipped_name("apg", "quad/RandomTracking-v0") == "apg-random"
+    assert shipped_name("dagger", "quad/RandomTracking-v0") == "dagger-random"
 
 
 def test_scores_of_teams_are_of_many_independent_teams_and_say_their_interval():
@@ -54,13 +55,14 @@ def test_a_shipped_policy_has_its_recorded_score(name):
     assert found.crashes == said["crashes"]
 
 
-def test_the_generalist_flies_all_tracking_ids_other_references_and_under_a_filter():
+@pytest.mark.parametrize("name", ["apg-generalist", "dagger-generalist"])
+def test_a_generalist_flies_all_tracking_ids_other_references_and_under_a_filter(name):
     ids = [env_id for env_id in TRACKING if env_id != "quad/CorridorTracking-v0"]
     for env_id in ids:
-        assert evaluate("apg-generalist", env_id, 3, CHOOSING).summary()["score"].mean > 0.7, env_id
+        assert evaluate(name, env_id, 3, CHOOSING).summary()["score"].mean > 0.7, env_id
     racetrack = gymnasium.make(ids[0], reference="racetrack", disturbance="gusts")
-    assert not any(record.crashed for record in evaluate("apg-generalist", racetrack, 3, CHOOSING).records)
-    kept = evaluate("safe:apg-generalist", "quad/CorridorTracking-v0", 1, CHOOSING)
+    assert not any(record.crashed for record in evaluate(name, racetrack, 3, CHOOSING).records)
+    kept = evaluate(f"safe:{name}", "quad/CorridorTracking-v0", 1, CHOOSING)
     assert kept.records[0].violation_share == 0.0
 
 
