@@ -16,13 +16,13 @@ import math
 import re
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
 from baselines.files import write_atomic
 from baselines.report.answer import percent, rounded
-from baselines.sweeps.contenders import VIOLATING
+from baselines.sweeps.contenders import VIOLATING, rank
 
 PLACE = Path(__file__).parent / "results"
 PAGE, NUMBERS, FACTS = (PLACE / name for name in ("protocol.md", "protocol.csv", "protocol.json"))
@@ -155,9 +155,12 @@ def _markdown(columns: dict[str, Callable[[Row], str]], rows: Rows) -> str:
     """A table; columns in which nobody has a number are left out."""
     cells = {name: [cell(row) for row in rows] for name, cell in columns.items()}
     said = {name: column for name, column in cells.items() if any(column)}
-    lines = ["| " + " | ".join(said) + " |", "|---" * len(said) + "|"]
-    lines += ["| " + " | ".join(one) + " |" for one in zip(*said.values(), strict=True)]
-    return "\n".join(lines) + "\n"
+    return _table(list(said), zip(*said.values(), strict=True))
+
+
+def _table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    found = ["| " + " | ".join(cells) + " |" for cells in (head, *lines)]
+    return "\n".join([found[0], "|---" * len(head) + "|", *found[1:]]) + "\n"
 
 
 def _conditions(rows: Rows) -> str:
@@ -186,9 +189,9 @@ def _score(row: Row, best: bool) -> str:
 
 
 def _judged(row: Row) -> tuple[float, ...]:
-    """Less is better: crashes, then violations above the share allowed, then the score."""
+    """As the protocol finds its best MPC: less is better."""
     crashed = _number(row, "crashed") / float(row["flights"])
-    return crashed, max(0.0, _number(row, "violation_share") - VIOLATING), _rank(row)
+    return rank(crashed, _number(row, "violation_share"), _number(row, "score"))
 
 
 def _is_mpc(row: Row) -> bool:
@@ -216,24 +219,19 @@ def sides(cells: Sequence[tuple[str, str]], paired: bool) -> str:
         here = [row for row in rows if (row["env"], row["condition"]) == (env, condition)]
         if here:
             found = [cell for label in labels for cell in _beside(here, label, paired)]
-            lines.append("| " + " | ".join([f"{env}, {condition}", *found]) + " |")
-    head = ["", *[f"{label}: {side}" for label in labels for side in _SIDES]]
-    return "\n".join(["| " + " | ".join(head) + " |", "|---" * len(head) + "|", *lines]) + "\n"
+            lines.append([f"{env}, {condition}", *found])
+    return _table(["", *[f"{label}: {side}" for label in labels for side in _SIDES]], lines)
 
 
 def _beside(rows: Rows, label: str, paired: bool) -> Iterator[str]:
     """Cells of the best of each side of a table."""
-    best = {}
-    for side, belongs in _SIDES.items():
-        found = sorted((row for row in rows if row["table"] == label and belongs(row)), key=_judged)
-        best[side] = found[0] if found else None
-    leads = min((row for row in best.values() if row), key=_judged, default=None)
-    for row in best.values():
-        if row is None:
-            yield ""
-            continue
-        minus = f"; {_minus(row)}" if paired and row["mpc"] != "True" and _minus(row) else ""
-        yield f"{_policy(row)} {_score(row, row is leads)}{minus}"
+    here = [row for row in rows if row["table"] == label]
+    best = [min(filter(belongs, here), key=_judged, default=None) for belongs in _SIDES.values()]
+    leads = min(filter(None, best), key=_judged, default=None)
+    for row in best:
+        minus = _minus(row) if row and paired else ""  # the best MPC is who others are compared with
+        said = f"; {minus}" if minus else ""
+        yield f"{_policy(row)} {_score(row, row is leads)}{said}" if row else ""
 
 
 def _of_teams(label: str) -> bool:

@@ -172,14 +172,25 @@ def plans(policy: PolicyChoice) -> bool:
     return not (policy.shipped or policy.train) and is_mpc(behind_filter(policy.name))
 
 
+def rank(crashed: float, violating: float, score: float) -> tuple[float, ...]:
+    """Less is better: crashes come before violations of more than VIOLATING, these before the score.
+
+    Args:
+        crashed: Share of the flights.
+        violating: Share of the steps.
+        score: Mean.
+    """
+    return crashed, max(0.0, violating - VIOLATING), -score
+
+
 def rank_of(evaluations: Sequence[Evaluation]) -> tuple[float, ...]:
-    """Less is better: crashes come before violations of more than VIOLATING, these before the score."""
+    """The `rank` of flights, all of them alike."""
     records = [record for one in evaluations for record in one.records]
     crashed, violating, score = (
         float(np.mean([getattr(record, name) for record in records]))
         for name in ("crashed", "violation_share", "score")
     )
-    return crashed, max(0.0, violating - VIOLATING), -score
+    return rank(crashed, violating, score)
 
 
 def _kind(policy: PolicyChoice) -> str:
