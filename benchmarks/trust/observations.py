@@ -30,7 +30,7 @@ _ENVS = {
 }
 _HUGE = (1e2, 1e4, 1e8, 1e20, 1e37)
 _BAD = (np.nan, np.inf, -np.inf)
-_ROWS = (1, 2, 4, 5, 16, 33)  # of a batch: up to four are decided in another way than more
+_ROWS = (1, 2, 4, 5, 16, 33)  # of a batch: four are a tile of a network's kernel, and a block of the solver's
 _STARTS = 4
 
 

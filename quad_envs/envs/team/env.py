@@ -145,7 +145,7 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
         if self._pictures:
             self._pictures.record()
         self._let_fly(np.arange(len(self.possible_agents)))
-        *_, infos = self._tell(self.agents, self._batch.parts(told))
+        *_, infos = self._tell(self.agents, self._batch.parts(told), False)
         return dict(zip(self.agents, observations, strict=True)), infos
 
     def step(
@@ -168,8 +168,9 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
             observations = observations[which]
             numbers, counts, flags, values, terms = parts
             parts = Parts(numbers[:, which], counts[:, which], flags[:, which], values[which], terms[which])
-        rewards, terminated, truncated, infos = self._tell(agents, parts)
-        if parts.somebody_ends():
+        ends = parts.somebody_ends()
+        rewards, terminated, truncated, infos = self._tell(agents, parts, ends)
+        if ends:
             self._let_fly(which[[not (terminated[name] or truncated[name]) for name in agents]])
         return dict(zip(agents, observations, strict=True)), rewards, terminated, truncated, infos
 
@@ -242,13 +243,13 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
         self._of_each: Any = itemgetter(*self.agents) if self.agents else None
 
     def _tell(
-        self, agents: list[str], parts: Parts
+        self, agents: list[str], parts: Parts, ends: bool
     ) -> tuple[dict[str, float], dict[str, bool], dict[str, bool], dict[str, Named]]:
         """Rewards, terminations, truncations and infos of the agents; arrays are rows of one of the team."""
         rewards, *numbers = parts.numbers.tolist()
         crashed, truncated, violated, terminated, _ = parts.flags.tolist()
         columns = *numbers, *parts.counts.tolist(), crashed, violated, parts.values, parts.terms
-        told, ends = zip(*columns, strict=True), parts.somebody_ends()
+        told = zip(*columns, strict=True)
         infos = [
             {
                 "cost": cost,
