@@ -1,5 +1,6 @@
-"""Commands as processes that a test can interrupt."""
+"""Other processes: commands that a test can interrupt, and code with and without compilation."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -18,3 +19,17 @@ def start_command(*arguments):
         text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
+
+
+def printed_compiled_and_plain(code):
+    """What the code prints with compiled kernels, and with kernels that run as plain Python."""
+    return [
+        subprocess.run(
+            [sys.executable, "-W", "ignore", "-c", code],
+            capture_output=True,
+            text=True,
+            check=True,
+            env={**os.environ, "NUMBA_DISABLE_JIT": flag},
+        ).stdout
+        for flag in "01"
+    ]

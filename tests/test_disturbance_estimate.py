@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
+from training_estimates import assert_seen_as_in_flight
 
 import quad_envs  # noqa: F401
 from baselines import (
@@ -178,14 +179,7 @@ def test_training_flights_show_networks_what_they_see_in_flight():
     options = training_options(RANDOM, {"randomize": 0.2})
     flights = DifferentiableFlights(options, 6, 0, training_features(options, disturbance_estimate=True))
     flights._cut[:] = [3, 5, 7, 9, 11, 100]
-    estimator = DisturbanceEstimator(flights.task)
-    memory, start = np.zeros((6, estimator.memory_size)), np.ones(6, dtype=np.bool_)
-    columns, scale = flights.features.columns(estimator.task.layout), np.array(flights.features.scale)
-    for _ in range(15):
-        seen, memory = estimator.extend(flights._out, memory, start)
-        wanted = (seen[:, columns] - np.array(flights.features.mean)) / scale
-        np.testing.assert_allclose(flights.observe(), wanted, atol=1e-5)
-        start = flights.advance(np.zeros((6, 4), dtype=np.float32)).done
+    assert_seen_as_in_flight(flights)
 
 
 def test_a_team_is_not_trained_in_axes_of_a_heading():

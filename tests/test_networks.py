@@ -1,15 +1,13 @@
 """Networks in flight: what they compute, and that a row has the same bits whatever rows are beside it."""
 
 import json
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from itertools import pairwise
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from processes import printed_compiled_and_plain
 
 from baselines import evaluate, export_policy, make_policy, run_benchmark, shipped_policies
 from baselines.policies.checkpoints import load_checkpoint
@@ -195,17 +193,8 @@ def test_a_network_runs_as_plain_python_for_debugging():
         "seen = np.random.default_rng(0).normal(size=(5, policy.task.layout.size)).astype('f4')\n"
         "print(policy.predict(seen)[0].tobytes().hex())"
     )
-    runs = [
-        subprocess.run(
-            [sys.executable, "-W", "ignore", "-c", code],
-            capture_output=True,
-            text=True,
-            check=True,
-            env={**os.environ, "NUMBA_DISABLE_JIT": flag},
-        ).stdout
-        for flag in "01"
-    ]
-    assert runs[0] == runs[1]
+    compiled, plain = printed_compiled_and_plain(code)
+    assert compiled == plain
 
 
 def without_times(records):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from training_estimates import assert_seen_as_in_flight
 
 from baselines import check_policy, evaluate, make_policy
 from baselines.policies.disturbance_estimate import DisturbanceEstimator, with_estimate
@@ -121,14 +122,7 @@ def test_teams_in_training_see_what_they_see_in_flight():
     flights = DifferentiableTeams(options, 9, 0, training_features(options, disturbance_estimate=True))
     flights._cut[:] = [3, 6, 100]
     flights.begin_window(15)
-    estimator = DisturbanceEstimator(flights.task)
-    memory, start = np.zeros((9, estimator.memory_size)), np.ones(9, dtype=np.bool_)
-    columns, scale = flights.features.columns(estimator.task.layout), np.array(flights.features.scale)
-    for _ in range(15):
-        seen, memory = estimator.extend(flights._out, memory, start)
-        wanted = (seen[:, columns] - np.array(flights.features.mean)) / scale
-        np.testing.assert_allclose(flights.observe(), wanted, atol=1e-5)
-        start = flights.advance(np.zeros((9, 4), dtype=np.float32)).done
+    assert_seen_as_in_flight(flights)
     assert np.abs(flights.observe()[:, -3:]).max() > 0.1
 
 

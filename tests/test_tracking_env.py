@@ -1,14 +1,12 @@
 """The single tracking environment: reward, limits, observation, disturbances, reset and bad input."""
 
 import math
-import os
 import pickle
-import subprocess
-import sys
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from processes import printed_compiled_and_plain
 
 import quad_envs
 from quad_envs.constraints import TOLERANCE, constraint_scales, constraint_values, forces_from_actions
@@ -402,14 +400,5 @@ def test_kernels_run_as_plain_python_for_debugging():
         "env = gym.make('quad/HelixTracking-v0', preview=2, time_limit=0.1)\n"
         "print(env.reset(seed=0)[0].sum() + env.step(np.full(4, .1, 'f4'))[0].sum())"
     )
-    runs = [
-        subprocess.run(
-            [sys.executable, "-c", code],
-            capture_output=True,
-            text=True,
-            check=True,
-            env={**os.environ, "NUMBA_DISABLE_JIT": flag},
-        ).stdout
-        for flag in "01"
-    ]
-    assert float(runs[0]) == pytest.approx(float(runs[1]), rel=1e-6)
+    compiled, plain = printed_compiled_and_plain(code)
+    assert float(compiled) == pytest.approx(float(plain), rel=1e-6)
