@@ -3,32 +3,39 @@
     python docs/protocol.py          # the pages anew from the numbers that are published
     python docs/protocol.py RUN      # publish those of a results folder first, with its frontiers
 
-Published are `contenders.csv` of the run, as it is, and what the run says of itself. docs/results/protocol.md
-has them all, docs/results/learned.md and README the best MPC beside the best network. MkDocs does not read
-this file; a test holds the pages to what it writes.
+A run may be a part of the protocol: its environments take the place of what was published of them, and the
+others stay. Published are the rows of `contenders.csv` for each environment, as they are, and what each run
+says of itself; means over environments are taken here. docs/results/protocol.md has them all,
+docs/results/learned.md and README the best MPC beside the best network. MkDocs does not read this file; a
+test holds the pages to what it writes.
 """
 
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 import re
 import shutil
+import statistics
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+from baselines import load_suite
 from baselines.files import write_atomic
 from baselines.report.answer import percent, rounded
-from baselines.sweeps.contenders import VIOLATING, rank
+from baselines.sweeps.contenders import ALL, VIOLATING, rank
+from baselines.sweeps.suite import BEST_MPC, Suite
 
 PLACE = Path(__file__).parent / "results"
 PAGE, NUMBERS, FACTS = (PLACE / name for name in ("protocol.md", "protocol.csv", "protocol.json"))
 ANSWER, README = PLACE / "learned.md", Path(__file__).parent.parent / "README.md"
 NOMINAL = "nominal"
-KEPT = ("protocol", "versions", "git_revision", "platform")  # of what a run says of itself
+OF_A_RUN = ("git_revision", "platform", "versions")  # what is kept of what a run says of itself
 # What README shows of it: environments and conditions.
 SHOWN = [
     ("Helix", NOMINAL),
@@ -48,54 +55,155 @@ def publish(run: Path) -> None:
     """Take the numbers, the facts and the frontiers of a results folder.
 
     Raises:
-        ValueError: If the folder holds no results of a protocol.
+        ValueError: If the folder holds no results of a protocol; results of another definition or of other
+            starts than those that stay; or less of an environment than is published.
     """
     config = json.loads((run / "config.json").read_text("utf-8"))
     if not config.get("protocol"):
         raise ValueError(f"{str(run)!r} holds no results of a protocol: fly quad-bench-2026.1 into it")
-    facts = {name: config[name] for name in KEPT} | {"tables": config["suite"]["tables"]}
-    shutil.copyfile(run / "contenders.csv", NUMBERS)
-    write_atomic(FACTS, (json.dumps(facts, indent=1) + "\n").encode())
-    for old in PLACE.glob("frontier-*.svg"):
+    said = {name: config["protocol"][name] for name in ("version", "definition", "starts")}
+    new = [row for row in _read(run / "contenders.csv") if row["env"] != ALL]
+    envs = list(dict.fromkeys(row["env"] for row in new))
+    old = _read(NUMBERS) if NUMBERS.exists() else []
+    stays = [row for row in old if row["env"] not in envs]
+    facts = json.loads(FACTS.read_text("utf-8")) if old else {"protocol": said, "runs": []}
+    lost = {_cell(row) for row in old if row["env"] in envs} - {_cell(row) for row in new}
+    if facts["protocol"] == said and lost:
+        raise ValueError(
+            f"{str(run)!r} lacks {len(lost)} of the cells that are published, {', '.join(min(lost))!r} among "
+            f"them: fly all of {', '.join(envs)}"
+        )
+    if facts["protocol"] != said and stays:
+        raise ValueError(
+            f"{str(run)!r} flew {said}, and published are numbers of {facts['protocol']}, which do not "
+            f"compare: fly all environments again, or delete {NUMBERS.name} first"
+        )
+    flown = {"envs": envs, "flown": config["protocol"]["flown"]} | {name: config[name] for name in OF_A_RUN}
+    earlier = [one | {"envs": [env for env in one["envs"] if env not in envs]} for one in facts["runs"]]
+    runs = [*(one for one in earlier if one["envs"]), flown]
+    write_atomic(FACTS, (json.dumps({"protocol": said, "runs": runs}, indent=1) + "\n").encode())
+    order = [env.title for env in load_suite(said["version"]).envs]
+    _write(NUMBERS, sorted([*stays, *new], key=lambda row: order.index(row["env"])))
+    for env in envs:
+        _take_frontiers(run, _stem(env))
+
+
+def _cell(row: Row) -> tuple[str, ...]:
+    return row["table"], row["env"], row["condition"], row["policy"]
+
+
+def _take_frontiers(run: Path, stem: str) -> None:
+    for old in PLACE.glob(f"frontier-{stem}-*.svg"):
         old.unlink()
-    for drawing in run.glob(f"frontier-*-{NOMINAL}-*.svg"):
+    for drawing in run.glob(f"frontier-{stem}-{NOMINAL}-*.svg"):
         shutil.copyfile(drawing, PLACE / drawing.name.replace(f"{NOMINAL}-", ""))
 
 
+def _read(path: Path) -> list[Row]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def _write(path: Path, rows: Rows) -> None:
+    """All columns that some row has."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, dict.fromkeys(name for row in rows for name in row), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_atomic(path, text.getvalue().encode())
+
+
+def _stem(title: str) -> str:
+    return title.lower().replace(" ", "-")
+
+
 def published() -> list[Row]:
-    """Contenders as published, but for those that only trace the frontier."""
-    with NUMBERS.open(encoding="utf-8", newline="") as file:
-        return [row for row in csv.DictReader(file) if not row["trace"]]
+    """Contenders, but for those that only trace the frontier, and their means over environments."""
+    rows = [row for row in _read(NUMBERS) if not row["trace"]]
+    return [*rows, *_means(rows)]
+
+
+def _means(rows: Rows) -> Iterator[Row]:
+    """Of those that flew in every environment of a table under a condition, where there are several.
+
+    Intervals of the environments are independent: half the width of their mean's is the root of the sum of
+    squares, by their number.
+    """
+    for table, condition in dict.fromkeys((row["table"], row["condition"]) for row in rows):
+        here = [row for row in rows if (row["table"], row["condition"]) == (table, condition)]
+        envs = list(dict.fromkeys(row["env"] for row in here))
+        for policy in dict.fromkeys(row["policy"] for row in here):
+            own = [row for row in here if row["policy"] == policy]
+            if 1 < len(envs) == len(own):
+                yield _mean(own)
+
+
+def _mean(rows: Rows) -> Row:
+    first, size = rows[0], len(rows)
+    minus = [_number(row, "score_minus_base") for row in rows]
+    half = [_half(row) for row in rows]
+    mean, width = sum(minus) / size, math.hypot(*half) / size
+    same = {name: first[name] for name in ("table", "condition", "policy", "kind", "mpc")}
+    summed = {name: sum(int(row[name]) for row in rows) for name in ("crashed", "flights")}
+    means = {name: sum(_number(row, name) for row in rows) / size for name in ("score", "violation_share")}
+    found = {
+        "env": ALL,
+        "environments": size,
+        "base": first["policy"] if all(row["policy"] == row["base"] for row in rows) else BEST_MPC,
+        "decision_p50_ms": statistics.median(_number(row, "decision_p50_ms") for row in rows),
+        "score_minus_base": mean,
+        "score_minus_base_low": mean - width,
+        "score_minus_base_high": mean + width,
+    }
+    return same | {name: str(value) for name, value in (summed | means | found).items()}
+
+
+def _half(row: Row) -> float:
+    """Half the width of the interval of the difference from the best MPC; nothing for itself."""
+    if row["policy"] == row["base"]:
+        return 0.0
+    return 0.5 * (_number(row, "score_minus_base_high") - _number(row, "score_minus_base_low"))
 
 
 def tables() -> str:
     """The tables as Markdown, an environment after the other."""
-    facts, rows = json.loads(FACTS.read_text("utf-8")), published()
-    return "\n".join([_origin(facts), *_sections(facts["tables"], rows)]) + "\n"
-
-
-def _origin(facts: dict[str, Row]) -> str:
-    said = facts["protocol"]
-    part = "all of it" if said["whole"] else "a part of it"
+    facts = json.loads(FACTS.read_text("utf-8"))
+    suite = load_suite(facts["protocol"]["version"])
     return (
-        f"Flown: {part}, digest `{said['flown']}`, of definition `{said['definition']}`, at revision "
-        f"{facts['git_revision'][:7]}; judged starts {said['starts']['judging']}.\n"
+        "\n".join([_origin(facts, suite), *_sections([one.label for one in suite.tables], published())])
+        + "\n"
     )
 
 
-def _sections(listed: Sequence[Row], rows: Rows) -> Iterator[str]:
+def _origin(facts: dict[str, Any], suite: Suite) -> str:
+    """Which environments were flown at which revision, and which were not."""
+    said, runs = facts["protocol"], facts["runs"]
+    flown = [env for run in runs for env in run["envs"]]
+    missing = [env.title for env in suite.envs if env.title not in flown]
+    parts = [
+        f"{', '.join(run['envs'])} at revision {run['git_revision'][:7]} (digest `{run['flown']}`)"
+        for run in runs
+    ]
+    return (
+        f"Definition `{said['definition']}`, judged starts {said['starts']['judging']}. "
+        f"Flown: {'; '.join(parts)}. "
+        f"{'Not flown: ' + ', '.join(missing) + '.' if missing else 'That is all of it.'}\n"
+    )
+
+
+def _sections(labels: Sequence[str], rows: Rows) -> Iterator[str]:
     for env in dict.fromkeys(row["env"] for row in rows):
-        for table in listed:
-            here = [row for row in rows if row["env"] == env and row["table"] == table["label"]]
+        for label in labels:
+            here = [row for row in rows if row["env"] == env and row["table"] == label]
             if not here:
                 continue
-            yield f"## {env[0].upper()}{env[1:]}, {table['label']}\n"
+            yield f"## {env[0].upper()}{env[1:]}, {label}\n"
             plain = [row for row in here if row["condition"] == NOMINAL]
             yield _markdown(_NUMBERS, sorted(plain, key=_rank))
             yield _conditions(here)
-            picture = f"frontier-{env.lower()}-{table['label'].replace(' ', '-')}.svg"
+            picture = f"frontier-{_stem(env)}-{_stem(label)}.svg"
             if (PLACE / picture).exists():
-                yield f"![Score against quadratic cost, {env}, {table['label']}]({picture})\n"
+                yield f"![Score against quadratic cost, {env}, {label}]({picture})\n"
 
 
 def _number(row: Row, name: str) -> float:
@@ -176,7 +284,9 @@ def _conditions(rows: Rows) -> str:
         return "" if row is None else _score(row, _rank(row) == best[condition])
 
     plain = sorted((row for row in rows if row["condition"] == NOMINAL), key=_rank)
-    return _markdown({"score": _policy} | {name: partial(cell, name) for name in found}, plain)
+    size = {row["condition"]: row.get("environments", "") for row in rows}
+    names = {name: f"{name}, mean of {size[name]}" if size[name] else name for name in found}
+    return _markdown({"score": _policy} | {names[name]: partial(cell, name) for name in found}, plain)
 
 
 def _score(row: Row, best: bool) -> str:
@@ -219,7 +329,8 @@ def sides(cells: Sequence[tuple[str, str]], paired: bool) -> str:
         here = [row for row in rows if (row["env"], row["condition"]) == (env, condition)]
         if here:
             found = [cell for label in labels for cell in _beside(here, label, paired)]
-            lines.append([f"{env}, {condition}", *found])
+            where = f"mean of {here[0]['environments']}" if env == ALL else env
+            lines.append([f"{where}, {condition}", *found])
     return _table(["", *[f"{label}: {side}" for label in labels for side in _SIDES]], lines)
 
 
@@ -239,8 +350,8 @@ def _of_teams(label: str) -> bool:
 
 
 def _all_cells() -> list[tuple[str, str]]:
-    """Of single vehicles, without the means over environments, which name no best MPC."""
-    told = [row for row in published() if not _of_teams(row["table"]) and row["base"]]
+    """Of single vehicles."""
+    told = [row for row in published() if not _of_teams(row["table"])]
     return list(dict.fromkeys((row["env"], row["condition"]) for row in told))
 
 

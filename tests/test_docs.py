@@ -173,6 +173,62 @@ def test_only_results_of_a_protocol_are_published(tmp_path):
         script("protocol").publish(tmp_path)
 
 
+@pytest.fixture
+def protocol(tmp_path, monkeypatch):
+    """The script, which publishes elsewhere; and `flown`, a results folder as far as it reads it."""
+    made = script("protocol")
+    for name, file in {"PLACE": "", "NUMBERS": "protocol.csv", "FACTS": "protocol.json"}.items():
+        monkeypatch.setattr(made, name, tmp_path / file)
+    real = made._read(ROOT / "docs" / "results" / "protocol.csv")
+
+    def flown(name, env, start=10_000, conditions=("nominal", "gusts"), like="Helix"):
+        run = tmp_path / name
+        run.mkdir()
+        of = {"version": "quad-bench-2026.1", "definition": "d", "flown": name, "starts": {"judging": start}}
+        config = {"protocol": of, "git_revision": name * 10, "platform": "", "versions": {}}
+        (run / "config.json").write_text(json.dumps(config))
+        rows = [row for row in real if row["env"] == like and row["condition"] in conditions]
+        made._write(run / "contenders.csv", [row | {"env": env} for row in rows])
+        (run / f"frontier-{env.lower()}-nominal-levelled.svg").write_text(name)
+        return run
+
+    return made, flown
+
+
+def test_a_part_of_the_protocol_takes_the_place_of_what_was_published_of_its_environments(protocol):
+    made, flown = protocol
+    made.publish(flown("first", "Line"))
+    made.publish(flown("second", "Spiral"))
+    made.publish(flown("third", "Line", conditions=("nominal", "gusts", "sensor noise")))
+    rows = made.published()
+    assert [row["env"] for row in rows if row["policy"] == "lmpc" and row["condition"] == "sensor noise"] == [
+        "Line"
+    ]
+    runs = json.loads(made.FACTS.read_text())["runs"]
+    assert [(run["envs"], run["flown"]) for run in runs] == [(["Spiral"], "second"), (["Line"], "third")]
+    assert (made.PLACE / "frontier-line-levelled.svg").read_text() == "third"
+    means = [row for row in rows if row["env"] == made.ALL]
+    assert {(row["environments"], row["condition"]) for row in means} == {("2", "nominal"), ("2", "gusts")}
+    for mean in means:  # of two environments with the same numbers
+        one = next(row for row in rows if made._cell(row) == made._cell(mean | {"env": "Line"}))
+        for name in ("score", "violation_share", "score_minus_base"):
+            assert float(mean[name]) == pytest.approx(float(one[name]), abs=1e-15)
+        assert made._half(mean) == pytest.approx(made._half(one) / 2**0.5, abs=1e-15)
+
+
+def test_what_does_not_compare_is_not_published_together(protocol):
+    made, flown = protocol
+    made.publish(flown("first", "Line"))
+    kept = made.NUMBERS.read_bytes(), made.FACTS.read_bytes()
+    with pytest.raises(ValueError, match="do not compare"):
+        made.publish(flown("quick", "Spiral", start=5))
+    with pytest.raises(ValueError, match=r"lacks \d+ of the cells.*fly all of Line"):
+        made.publish(flown("less", "Line", conditions=("nominal",)))
+    assert (made.NUMBERS.read_bytes(), made.FACTS.read_bytes()) == kept
+    made.publish(flown("anew", "Line", start=5))
+    assert json.loads(made.FACTS.read_text())["protocol"]["starts"] == {"judging": 5}
+
+
 def test_every_page_is_in_the_navigation_and_every_entry_of_it_is_a_page():
     listed = re.findall(r": (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
     assert sorted(listed) == sorted(page.relative_to(ROOT / "docs").as_posix() for page in PAGES[1:])
