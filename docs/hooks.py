@@ -14,6 +14,7 @@ import re
 from dataclasses import MISSING, fields
 from typing import Any
 
+_WIDE = 7  # bars of a line of a table with more than six columns
 _INLINE = re.compile(r'<span class="arithmatex">\\\((.*?)\\\)</span>', re.DOTALL)
 _DISPLAY = re.compile(r'<div class="arithmatex">\\\[(.*?)\\\]</div>', re.DOTALL)
 _SHIM, _OWN_SHIM = "https://unpkg.com/iframe-worker/shim", "vendor/iframe-worker.js"
@@ -135,11 +136,19 @@ _TABLES = {
 }
 
 
-def on_page_markdown(markdown: str, **kwargs: Any) -> str:
-    """The page with its tables of what the code knows, where it has some."""
+def with_tables(markdown: str) -> str:
+    """A page with its tables of what the code knows, where it has some."""
     for mark, table in _TABLES.items():
         if mark in markdown:
             markdown = markdown.replace(mark, table())
+    return markdown
+
+
+def on_page_markdown(markdown: str, page: Any, **kwargs: Any) -> str:
+    """The page with its tables; where one is wide, it takes the place of the contents beside it."""
+    markdown = with_tables(markdown)
+    if any(line.startswith("|") and line.count("|") > _WIDE for line in markdown.splitlines()):
+        page.meta.setdefault("hide", []).append("toc")
     return markdown
 
 

@@ -169,10 +169,10 @@ def tables() -> str:
     """The tables as Markdown, an environment after the other."""
     facts = json.loads(FACTS.read_text("utf-8"))
     suite = load_suite(facts["protocol"]["version"])
-    return (
-        "\n".join([_origin(facts, suite), *_sections([one.label for one in suite.tables], published())])
-        + "\n"
-    )
+    sections = list(_sections([one.label for one in suite.tables], published()))
+    titles = [line[3:].strip() for line in sections if line.startswith("## ")]
+    links = " · ".join(f"[{title}](#{_stem(title.replace(',', ''))})" for title in titles)
+    return "\n".join([_origin(facts, suite), f"{links}\n", *sections]) + "\n"
 
 
 def _origin(facts: dict[str, Any], suite: Suite) -> str:
@@ -219,7 +219,8 @@ def _spread(name: str) -> Callable[[Row], str]:
 
     def cell(row: Row) -> str:
         value, low, high = (_number(row, name + end) for end in ("", "_low", "_high"))
-        return rounded(value, 0.5 * (high - low)) if math.isfinite(value) else ""
+        said = rounded(value, 0.5 * (high - low)) if math.isfinite(value) else ""
+        return said.replace(" ", "\N{NO-BREAK SPACE}")
 
     return cell
 

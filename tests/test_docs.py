@@ -257,18 +257,18 @@ def script(name):
 
 def test_pages_get_every_column_of_the_tables():
     page = ROOT / "docs" / "contracts" / "environments.md"
-    text = script("hooks").on_page_markdown(page.read_text(encoding="utf-8"))
+    text = script("hooks").with_tables(page.read_text(encoding="utf-8"))
     for name in ("quadratic_cost", "constraint_cost", "position_rms", "anees", "crashed", "left_model"):
         assert re.search(rf"^\| `{name}` \|", text, re.MULTILINE), name
     files = (ROOT / "docs" / "contracts" / "files.md").read_text(encoding="utf-8")
-    assert "| `vx_ref`, `vy_ref`, `vz_ref` | m/s |" in script("hooks").on_page_markdown(files)
+    assert "| `vx_ref`, `vy_ref`, `vz_ref` | m/s |" in script("hooks").with_tables(files)
     row = next(line for line in text.splitlines() if line.startswith("| `effort`"))
     assert row.count("|") - row.count(r"\|") == 5  # bars of the mathematics end no cell
 
 
 def test_the_page_on_training_gets_every_hyperparameter_with_its_meaning():
     page = ROOT / "docs" / "tutorial" / "training.md"
-    text = script("hooks").on_page_markdown(page.read_text(encoding="utf-8"))
+    text = script("hooks").with_tables(page.read_text(encoding="utf-8"))
     for name, entry in ALGORITHMS.items():
         table = text.split(f"### {name}\n")[1].split("###")[0]
         for field, comment in field_comments(entry.options).items():
@@ -279,7 +279,7 @@ def test_the_page_on_training_gets_every_hyperparameter_with_its_meaning():
 @pytest.mark.parametrize("kind", [TrainingRequest, BenchmarkRequest])
 def test_the_page_on_baselines_gets_the_arguments_of_long_functions(kind):
     page = ROOT / "docs" / "api" / "baselines.md"
-    text = script("hooks").on_page_markdown(page.read_text(encoding="utf-8"))
+    text = script("hooks").with_tables(page.read_text(encoding="utf-8"))
     for field, comment in field_comments(kind).items():
         rows = [line for line in text.splitlines() if line.startswith(f"| `{field}` |")]
         assert comment and any(line.endswith(f"| {comment} |") and line.count("|") == 4 for line in rows)
@@ -290,7 +290,7 @@ LAWS = (SdreOptions, LqrOptions, FeedbackLinearizationOptions)
 
 def test_the_page_on_controllers_gets_every_option_with_its_meaning():
     page = ROOT / "docs" / "api" / "controllers.md"
-    text = script("hooks").on_page_markdown(page.read_text(encoding="utf-8"))
+    text = script("hooks").with_tables(page.read_text(encoding="utf-8"))
     for kind in (LmpcOptions, SdcOptions, NmpcOptions, CooperativeOptions, CentralOptions, *LAWS):
         for field, comment in field_comments(kind).items():
             rows = [line for line in text.splitlines() if line.startswith(f"| `{field}` |")]
