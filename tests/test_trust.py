@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import time
 from dataclasses import replace
 
 import gymnasium as gym
@@ -25,7 +26,7 @@ from baselines import (
 from baselines.policies.network import NetworkPolicy
 from baselines.report import render_report
 from baselines.sweeps.folder import read_run
-from benchmarks.trust import kills, malformed, observations, problems, repeat, soak
+from benchmarks.trust import found, kills, malformed, observations, problems, repeat, soak
 from benchmarks.trust.__main__ import FIGURES, Outcome, table, try_out
 from controllers import CentralOptions, ConsensusOptions, LmpcOptions, SdcOptions
 from quad_envs import cooperative_estimation_v0, formation_v0
@@ -41,6 +42,15 @@ def test_an_observation_beyond_what_a_network_holds_is_refused_by_its_row(rows):
     observation[-1] = 3e38
     with pytest.raises(ValueError, match=f"no action follows from observation {rows - 1}: entry 0 of 'V_B'"):
         NetworkPolicy(network, env.unwrapped.task, "large").predict(observation)
+
+
+def test_a_try_hangs_by_its_cpu_time_or_by_the_clock(monkeypatch):
+    short = tuple(one._replace(seconds=one.seconds / 600.0) for one in found.LIMITS)
+    monkeypatch.setattr(found, "LIMITS", short)
+    busy = found.tried("busy", lambda: next(k for k in itertools.count() if k < 0))
+    assert busy.wrong[0].startswith("busy: Hangs: for 0.1 CPU-s, in <genexpr> of ")
+    assert "Hangs: for 1 s by the clock" in found.tried("asleep", lambda: time.sleep(30.0)).wrong[0]
+    assert found.tried("short", lambda: time.sleep(0.2)) == found.Found(1)
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -8,7 +8,21 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import NamedTuple
 
-_SECONDS = 60.0  # after which a try hangs
+
+class Limit(NamedTuple):
+    """When a try hangs."""
+
+    timer: int  # of `signal.setitimer`
+    number: int  # signal that it sends
+    seconds: float
+    unit: str
+
+
+# By its CPU time, since the clock runs on where others share the machine; by the clock, since it may wait.
+LIMITS = (
+    Limit(signal.ITIMER_PROF, signal.SIGPROF, 60.0, "CPU-s"),
+    Limit(signal.ITIMER_REAL, signal.SIGALRM, 600.0, "s by the clock"),
+)
 
 
 class Found(NamedTuple):
@@ -31,8 +45,9 @@ class Figure(NamedTuple):
 
 def tried(what: str, run: Callable[[], str | None]) -> Found:
     """One try; `run` says what is wrong, or nothing. What it raises is wrong, too, and so is to hang."""
-    before = signal.signal(signal.SIGALRM, _hangs)
-    signal.setitimer(signal.ITIMER_REAL, _SECONDS)
+    before = {limit.number: signal.signal(limit.number, _hangs) for limit in LIMITS}
+    for limit in LIMITS:
+        signal.setitimer(limit.timer, limit.seconds)
     try:
         said = run() or ""
     except KeyboardInterrupt:
@@ -40,8 +55,9 @@ def tried(what: str, run: Callable[[], str | None]) -> Found:
     except BaseException as error:  # SystemExit, too
         said = f"{type(error).__name__}: {error}"
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
+        for limit in LIMITS:
+            signal.setitimer(limit.timer, 0.0)
+            signal.signal(limit.number, before[limit.number])
     return Found(1, (f"{what}: {' '.join(said.split())[:400]}",) if said else ())
 
 
@@ -51,4 +67,5 @@ class Hangs(BaseException):
 
 def _hangs(number: int, frame: FrameType | None) -> None:
     where = traceback.extract_stack(frame)[-1]
-    raise Hangs(f"for {_SECONDS:.0f} s, in {where.name} of {where.filename}")
+    limit = next(one for one in LIMITS if one.number == number)
+    raise Hangs(f"for {limit.seconds:g} {limit.unit}, in {where.name} of {where.filename}")
