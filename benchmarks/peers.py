@@ -8,40 +8,25 @@ import numpy as np
 
 from controllers import dare, hover_pair
 from controllers.qp import Multipliers, Solution, Status
-from controllers.qp.ocp import OcpQp, condense, first_move_bounds
+from controllers.qp.ocp import OcpQp
 from quad_envs.constraints import actions_from_forces
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 from quad_envs.tasks import Task
 
+from .condensed import solve_daqp
+
 
 class DaqpSolver:
-    """DAQP, a dense active-set solver in C, on the condensed problem; box and rate rows only."""
+    """DAQP, a dense active-set solver in C, on the condensed problem; hard rows only."""
 
     def solve(self, qp: OcpQp) -> Solution:
         """Condense and solve."""
-        import daqp
-
-        if len(qp.rows.stage):
-            raise ValueError("the DAQP comparison takes box and rate rows only")
-        H, g, S, f = condense(qp)
-        N, size = len(qp.c), len(g)
-        moves = np.eye(size) - np.eye(size, k=-N_INPUT)
-        low, high = np.tile(qp.lower, N), np.tile(qp.upper, N)
-        step_low, step_high = np.full(size, -qp.rate_step), np.full(size, qp.rate_step)
-        first_low, first_high = first_move_bounds(qp)
-        low[:N_INPUT], high[:N_INPUT] = (
-            np.maximum(low[:N_INPUT], first_low),
-            np.minimum(high[:N_INPUT], first_high),
-        )
-        step_low[:N_INPUT], step_high[:N_INPUT] = -1e30, 1e30
-        u, _, flag, info = daqp.solve(
-            H, g, moves, np.r_[high, step_high], np.r_[low, step_low], np.zeros(2 * size, np.int32)
-        )
-        x = np.einsum("ijk,k->ij", S, u) + f
+        if np.isfinite(qp.rows.weight).any():
+            raise ValueError("the DAQP comparison takes hard rows only")
+        u, x, flag, iterations = solve_daqp(qp)
         status = Status.OPTIMAL if flag == 1 else Status.INFEASIBLE
-        empty = np.zeros(0)
-        multipliers = Multipliers(*(np.zeros((N, N_INPUT)) for _ in range(4)), empty, empty)
-        return Solution(status, u.reshape(N, N_INPUT), x, multipliers, int(info["iterations"]))
+        nothing, none = np.zeros_like(u), np.zeros(len(qp.rows.weight))
+        return Solution(status, u, x, Multipliers(*(nothing,) * 4, none, none), iterations)
 
 
 class IpoptPolicy:

@@ -12,9 +12,10 @@ from ocp_problems import LIMITS, MODELS, random_qp
 from baselines import check_policy, make_policy
 from baselines.certify import certify
 from baselines.evaluation.rollout import run_episodes
+from benchmarks.condensed import dense_program
 from controllers import ExactNmpc, LinearMPC, SdcNmpc
 from controllers.qp import Status, StructuredSolver, residuals
-from controllers.qp.ocp import condense, first_move_bounds
+from controllers.qp.ocp import condense
 from controllers.qp.osqp import OsqpSolver
 from quad_envs.parameters import Limits
 from quad_envs.tasks import Task
@@ -107,10 +108,7 @@ def test_a_decision_is_the_one_of_an_independent_dense_program(mpc, rate):
     if mpc is SdcNmpc:  # whose decision may take a second pass with other matrices
         controller = mpc(task, horizon=N, R_rate=weights(rate, 3.0), relinearisations=0)
     H, g = dense(qp)
-    nv, first = len(g), first_move_bounds(qp)
-    matrix = np.eye(nv) - np.eye(nv, k=-4)
-    step = np.full(nv - 4, qp.rate_step)
-    lower, upper = np.r_[np.tile(qp.lower, N), first[0], -step], np.r_[np.tile(qp.upper, N), first[1], step]
+    _, _, matrix, lower, upper, _, _ = dense_program(qp)
     u, _, flag, _ = daqp.solve(
         H, g, matrix, upper, lower, np.zeros(len(lower), np.int32), primal_tol=1e-10, dual_tol=1e-10
     )

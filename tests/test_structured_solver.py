@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from ocp_problems import LIMITS, MODELS, hover_qp, random_qp, tilt_rows, velocity_rows
 
-from benchmarks.trust.problems import solve_daqp
+from benchmarks.condensed import solve_daqp
 from controllers.qp import Status, StructuredSolver, residuals
 from controllers.qp.ocp import (
     StateRows,
@@ -63,7 +63,7 @@ def compare_with_daqp(rng, trials, sizes):
     for _ in range(trials):
         qp = random_qp(rng, int(rng.choice(sizes)), rng.choice(MODELS), rng.choice(["none", "hard"]))
         solution = SOLVER.solve(qp)
-        u, flag = solve_daqp(qp)
+        u, _, flag, _ = solve_daqp(qp, primal_tol=1e-10, dual_tol=1e-10)
         assert (flag == 1) == (solution.status == Status.OPTIMAL)
         statuses.add(solution.status)
         if flag == 1:

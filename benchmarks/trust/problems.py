@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import count
 
-import daqp
 import numpy as np
 
 from controllers.qp import Status
-from controllers.qp.ocp import OcpQp, condense, first_move_bounds
-from quad_envs.parameters import N_INPUT, Array
+from controllers.qp.ocp import condense, first_move_bounds
+from quad_envs.parameters import Array
 
+from ..condensed import solve_daqp
 from ..solver import FAMILIES, Judged, is_soft, judge
 from .found import Found
 
@@ -20,6 +20,7 @@ _RESIDUAL = 1e-6  # what the solver allows itself is 1e-8; the rest is for sums 
 _DENSE = 15  # samples; the condensed matrix of more is not worth its round-off
 _SCALED = ("plain", "hard rows", "no freedom", "rate 0", "starts outside", "parallel rows", "equality rows")
 _ACCURATE = 1e-8
+_DAQP = {"primal_tol": 1e-10, "dual_tol": 1e-10}
 _OUTSIDE = 1e-9  # N, by which a command may leave its box
 
 
@@ -53,35 +54,12 @@ def _false(one: Judged) -> str:
     return "" if ((solution.u >= low) & (solution.u <= high)).all() else "a command is outside its box"
 
 
-def condensed_rows(qp: OcpQp) -> tuple[Array, ...]:
-    """H, g, A, lower, upper: the inputs' box, then rows A'u of rate and state limits, for dense solvers."""
-    H, g, S, f = condense(qp)
-    moves, rows = len(g), qp.rows
-    first_lower, first_upper = first_move_bounds(qp)
-    steps = np.full(moves - N_INPUT, qp.rate_step)
-    normals = rows.normals[rows.normal]
-    offset = np.einsum("kn,kn->k", normals, f[rows.stage])
-    values = np.einsum("kn,knv->kv", normals, S[rows.stage])
-    A = np.vstack([np.eye(moves) - np.eye(moves, k=-N_INPUT), values])
-    lower = np.r_[np.tile(qp.lower, moves // N_INPUT), first_lower, -steps, rows.lower - offset]
-    upper = np.r_[np.tile(qp.upper, moves // N_INPUT), first_upper, steps, rows.upper - offset]
-    return H, g, A, np.clip(lower, -1e30, 1e30), np.clip(upper, -1e30, 1e30)
-
-
-def solve_daqp(qp: OcpQp) -> tuple[Array, int]:
-    """DAQP's inputs (N, 4) and its flag, 1 if it has found them; all rows are taken as hard."""
-    H, g, A, lower, upper = condensed_rows(qp)
-    sense = np.zeros(len(lower), dtype=np.int32)
-    u, _, flag, _ = daqp.solve(H, g, A, upper, lower, sense, primal_tol=1e-10, dual_tol=1e-10)
-    return u[: len(g)].reshape(-1, N_INPUT), int(flag)
-
-
 def _beside(one: Judged) -> tuple[str, float]:
     """What DAQP says otherwise, and by how much the commands differ; nothing of problems with soft rows."""
     qp, solution = one.qp, one.solution
     if np.isfinite(qp.rows.weight).any():
         return "", 0.0
-    theirs, flag = solve_daqp(qp)
+    theirs, _, flag, _ = solve_daqp(qp, **_DAQP)
     if solution.status == Status.INACCURATE or flag not in (1, -1):
         return "", 0.0
     if (flag == 1) != (solution.status == Status.OPTIMAL):
