@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, get_type_hints
 
 import numpy as np
 import pytest
 
 from controllers.qp.ocp import IntArray
+from quad_envs.compilation import packed
 from quad_envs.compilation.decorators import kernel
 from quad_envs.compilation.packed import pack, unpacker
 from quad_envs.parameters import Array
@@ -48,6 +49,19 @@ def test_a_kernel_reads_and_writes_what_was_packed(pairs):
     value = value_of(pairs)
     assert read_and_write(pack(value)) == ((pairs, 12, 12), 144.0, 6, -7)
     np.testing.assert_array_equal(value.force, [1.0, -2.5, 3.0, 4.0])
+
+
+def test_the_hints_of_a_type_are_read_once(monkeypatch):
+    class Fresh(NamedTuple):
+        force: Annotated[Array, "4"]
+
+    read = []
+    monkeypatch.setattr(
+        packed, "get_type_hints", lambda kind, **how: read.append(kind) or get_type_hints(kind, **how)
+    )
+    for _ in range(3):
+        pack(Fresh(np.zeros(4)))
+    assert read == [Fresh]
 
 
 @pytest.mark.parametrize(

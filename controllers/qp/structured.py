@@ -439,7 +439,7 @@ class StructuredSolver:
                 f"iteration_limit must be at least 1, or 0 to grow with the problem, got {iteration_limit}"
             )
         self.iteration_limit = iteration_limit
-        self._workspace: Workspace | None = None
+        self._memory: tuple[Workspace, IntArray] | None = None  # and its words
 
     def solve(self, qp: OcpQp) -> Solution:
         """Solve one problem.
@@ -450,9 +450,9 @@ class StructuredSolver:
         validate(qp)
         rows = qp.rows
         N, K = len(qp.c), len(rows.normal)
-        ws = self._fitting_workspace(N, K, len(qp.A), qp.R_rate is not None)
+        ws, words = self._fitting_memory(N, K, len(qp.A), qp.R_rate is not None)
         fields = *qp[:-4], float(qp.rate_step), qp.u_last, *rows, rate_weight(qp)
-        status, iterations = solve_structured(*fields, self.iteration_limit, False, pack(ws))
+        status, iterations = solve_structured(*fields, self.iteration_limit, False, words)
         nv = N_INPUT * N
         edges = [nv, 2 * nv, 3 * nv, 4 * nv, 4 * nv + K]
         parts = np.split(ws.multipliers[: 4 * nv + 2 * K].copy(), edges)
@@ -460,18 +460,21 @@ class StructuredSolver:
         multipliers = Multipliers(*box_and_rate, *parts[4:])
         return Solution(Status(status), ws.u.copy(), ws.x.copy(), multipliers, iterations)
 
-    def _fitting_workspace(self, horizon: int, n_rows: int, n_models: int, weighs_changes: bool) -> Workspace:
-        """The kept workspace if the problem fits into it, else a larger one."""
-        ws = self._workspace
-        if ws is not None and len(ws.u) == horizon:
+    def _fitting_memory(
+        self, horizon: int, n_rows: int, n_models: int, weighs_changes: bool
+    ) -> tuple[Workspace, IntArray]:
+        """The kept workspace and its words if the problem fits into it, else a larger one."""
+        if self._memory is not None and len(self._memory[0].u) == horizon:
+            ws = self._memory[0]
             fits = len(ws.spans) >= n_rows and len(ws.transposed) >= n_models
             if fits and (ws.rate.size > 0 or not weighs_changes):
-                return ws
+                return self._memory
             n_rows, n_models = max(n_rows, len(ws.spans)), max(n_models, len(ws.transposed))
             weighs_changes = weighs_changes or ws.rate.size > 0
-        self._workspace = make_workspace(horizon, n_rows, n_models, weighs_changes)
-        return self._workspace
+        ws = make_workspace(horizon, n_rows, n_models, weighs_changes)
+        self._memory = ws, pack(ws)
+        return self._memory
 
     def __getstate__(self) -> dict[str, Any]:
         """The options alone: a workspace is scratch memory."""
-        return {"iteration_limit": self.iteration_limit, "_workspace": None}
+        return {"iteration_limit": self.iteration_limit, "_memory": None}

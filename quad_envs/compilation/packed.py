@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+from functools import cache
 from typing import Any, NamedTuple, get_args, get_type_hints
 
 import numpy as np
@@ -108,6 +109,7 @@ def _read_field(context: Any, builder: Any, view: View, first: Any, name: str) -
     return _read(context, builder, *view.layout.find(name), first)
 
 
+@cache  # reading hints takes longer than packing what they describe
 def _layout(kind: type) -> _Group:
     """What the annotations of a NamedTuple say."""
     found: list[Any] = []
@@ -128,8 +130,9 @@ def pack(named: Any) -> IntArray:
     Raises:
         TypeError: If a field is not what its annotation says.
     """
+    kind: type = type(named)
     words: list[int] = []
-    for name, part, value in zip(named._fields, _layout(type(named)).fields, named, strict=True):
+    for name, part, value in zip(named._fields, _layout(kind).fields, named, strict=True):
         if isinstance(part, _Group):
             words += pack(value).tolist()
         elif part.shape is None:
