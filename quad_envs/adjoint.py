@@ -37,7 +37,8 @@ from .rotations import sincos
 
 _PLANT = N_STATE + N_INPUT
 _MOST_SUBSTEPS = 64
-STAGE_ROWS = 14  # of scratch: stages of a substep, their sensitivities, the disturbance
+STAGE_ROWS = 13  # of scratch: stages of a substep and their sensitivities
+_N_DISTURBANCE = 6  # torque in body axes, force in inertial ones
 
 
 @inline_kernel
@@ -140,7 +141,10 @@ def _stages(
     w: Array,
     x_next: Array,
 ) -> None:
-    """The four stages of one substep into w[:4] (states) and w[4:8] (forces), and the state after it."""
+    """The four stages of one substep into w[:4] (states) and w[4:8] (forces), and the state after it.
+
+    d has the disturbances at its beginning, middle and end, (3, 6).
+    """
     half = math.exp(-0.5 * c[ROTOR_RATE] * h)
     k, ahead, decay, weight = w[8], 0.0, 1.0, 0.0
     for i in range(N_STATE):
@@ -154,7 +158,7 @@ def _stages(
         for i in range(N_STATE):
             w[s, i] = x[i] + ahead * k[i]
         _lag(F, command, force_max, decay, w[4 + s])
-        _derivative(w[s], w[4 + s], d, c, k)
+        _derivative(w[s], w[4 + s], d[(s + 1) // 2], c, k)
         weight = h / 3.0 if s == 1 or s == 2 else h / 6.0
         for i in range(N_STATE):
             x_next[i] += weight * k[i]
@@ -164,7 +168,7 @@ def _stages(
 def _substep_vjp(
     h: float, decay: float, c: Array, d: Array, w: Array, bar_x: Array, bar_F: Array, bar_command: Array
 ) -> None:
-    """Take bar_x and bar_F back over the substep whose stages are in w; adds to bar_command."""
+    """Take bar_x and bar_F back over the substep whose stages are in w; adds to bar_command. d as there."""
     weighted, back, gx, gF = w[9], w[10], w[11], w[12]
     for i in range(N_STATE):
         weighted[i] = bar_x[i]
@@ -179,7 +183,7 @@ def _substep_vjp(
         ahead = h if s == 2 else 0.5 * h if s < 2 else 0.0  # how far this stage's slope carries the next one
         for i in range(N_STATE):
             back[i] = weight * weighted[i] + ahead * back[i]
-        rigid_body_vjp(w[s], w[4 + s], d, c, back, gx, gF)
+        rigid_body_vjp(w[s], w[4 + s], d[(s + 1) // 2], c, back, gx, gF)
         lag = half if s == 1 or s == 2 else half * half if s == 3 else 1.0
         for i in range(N_STATE):
             bar_x[i] += gx[i]
@@ -191,9 +195,17 @@ def _substep_vjp(
 
 @kernel
 def roll_out(
-    plant: Array, command: Array, force_max: Array, c: Array, substeps: int, h: float, past: Array, w: Array
+    plant: Array,
+    command: Array,
+    force_max: Array,
+    c: Array,
+    substeps: int,
+    h: float,
+    d: Array,
+    past: Array,
+    w: Array,
 ) -> None:
-    """Fly a control period without disturbance, as `step_vjp_kernel` takes it back.
+    """Fly a control period, as `step_vjp_kernel` takes it back.
 
     Args:
         plant: Before it, (16,).
@@ -202,17 +214,16 @@ def roll_out(
         c: QuadrotorParams.coefficients().
         substeps: RK4 steps.
         h: Length of one, s.
+        d: Disturbances at the stage times, (2 substeps + 1, 6).
         past: Result: the plants before each substep and after the last, (substeps + 1, 16).
         w: Scratch, (STAGE_ROWS, 16).
     """
-    d, half = w[13], math.exp(-0.5 * c[ROTOR_RATE] * h)
-    for i in range(6):
-        d[i] = 0.0
+    half = math.exp(-0.5 * c[ROTOR_RATE] * h)
     for i in range(_PLANT):
         past[0, i] = plant[i]
     for s in range(substeps):
         x, following = past[s], past[s + 1]
-        _stages(x[:N_STATE], x[N_STATE:], command, force_max, c, h, d, w, following)
+        _stages(x[:N_STATE], x[N_STATE:], command, force_max, c, h, d[2 * s : 2 * s + 3], w, following)
         _lag(x[N_STATE:], command, force_max, half * half, following[N_STATE:])
 
 
@@ -223,18 +234,19 @@ def roll_back(
     force_max: Array,
     c: Array,
     h: float,
+    d: Array,
     bar_plant: Array,
     bar_command: Array,
     w: Array,
 ) -> None:
     """Take bar_plant back over the substep that began at a plant; adds to bar_command.
 
-    Saturated commands have their influence still, see `forget_saturated`. Arguments as in `roll_out`, which
-    has left its disturbance in w.
+    Saturated commands have their influence still, see `forget_saturated`. Arguments as in `roll_out`, but d
+    has the disturbances of this substep, (3, 6).
     """
     half = math.exp(-0.5 * c[ROTOR_RATE] * h)
-    _stages(plant[:N_STATE], plant[N_STATE:], command, force_max, c, h, w[13], w, w[12])
-    _substep_vjp(h, half, c, w[13], w, bar_plant[:N_STATE], bar_plant[N_STATE:], bar_command)
+    _stages(plant[:N_STATE], plant[N_STATE:], command, force_max, c, h, d, w, w[12])
+    _substep_vjp(h, half, c, d, w, bar_plant[:N_STATE], bar_plant[N_STATE:], bar_command)
 
 
 @inline_kernel
@@ -253,12 +265,13 @@ def step_vjp_kernel(
     c: Array,
     substeps: int,
     h: float,
+    d: Array,
     bar: Array,
     bar_plant: Array,
     bar_command: Array,
     w: Array,
 ) -> None:
-    """Adjoint of a control period of one vehicle without disturbance, see `step_vjp`.
+    """Adjoint of a control period of one vehicle, see `step_vjp`.
 
     Args:
         plant: Before it, (16,).
@@ -267,19 +280,20 @@ def step_vjp_kernel(
         c: QuadrotorParams.coefficients().
         substeps: RK4 steps, at most 64.
         h: Length of one, s.
+        d: Disturbances at the stage times, (2 substeps + 1, 6).
         bar: Sensitivity to the plant after it, (16,).
         bar_plant: Result, (16,).
         bar_command: Result, (4,).
         w: Scratch, (SCRATCH_ROWS, 16).
     """
     past = w[STAGE_ROWS:]
-    roll_out(plant, command, force_max, c, substeps, h, past, w)
+    roll_out(plant, command, force_max, c, substeps, h, d, past, w)
     for i in range(_PLANT):
         bar_plant[i] = bar[i]
     for i in range(N_INPUT):
         bar_command[i] = 0.0
     for s in range(substeps - 1, -1, -1):
-        roll_back(past[s], command, force_max, c, h, bar_plant, bar_command, w)
+        roll_back(past[s], command, force_max, c, h, d[2 * s : 2 * s + 3], bar_plant, bar_command, w)
     forget_saturated(command, force_max, bar_command)
 
 
@@ -294,6 +308,7 @@ def _step_vjp_rows(
     c: Array,
     substeps: int,
     h: float,
+    d: Array,
     bars: Array,
     bar_plants: Array,
     bar_commands: Array,
@@ -301,8 +316,9 @@ def _step_vjp_rows(
 ) -> None:
     for j in range(plants.shape[0]):
         step_vjp_kernel(
-            plants[j], commands[j], force_max, c, substeps, h, bars[j], bar_plants[j], bar_commands[j], w
-        )
+            plants[j], commands[j], force_max, c, substeps, h, d[j], bars[j],
+            bar_plants[j], bar_commands[j], w,
+        )  # fmt: skip
 
 
 def step_vjp(
@@ -314,6 +330,7 @@ def step_vjp(
     force_max: ArrayLike | None = None,
     duration: float = 0.05,
     substeps: int = 5,
+    disturbance: ArrayLike = 0.0,
 ) -> tuple[Array, Array]:
     """Adjoint of `dynamics.simulate`: sensitivities before a control period from those after it.
 
@@ -325,6 +342,8 @@ def step_vjp(
         force_max: Upper saturation of the rotor forces, N: one number or (4,); None for the weight.
         duration: s.
         substeps: RK4 steps, 1 to 64.
+        disturbance: Torque 3 (body axes, N m) and force 3 (inertial axes, N) at the stage times,
+            (..., 2 substeps + 1, 6), or what broadcasts to that.
 
     Returns:
         Sensitivities to the plant, (..., 16), and to the command, (..., 4).
@@ -335,10 +354,10 @@ def step_vjp(
     if not 1 <= substeps <= _MOST_SUBSTEPS:
         raise ValueError(f"substeps must be 1 to {_MOST_SUBSTEPS}, got {shown(substeps)}")
     plants = np.ascontiguousarray(plant, dtype=np.float64)
-    shape = plants.shape[:-1]
-    commands, bars = (
-        np.array(np.broadcast_to(np.asarray(value, dtype=np.float64), (*shape, size))).reshape(-1, size)
-        for value, size in ((command, N_INPUT), (bar, _PLANT))
+    shape, nodes = plants.shape[:-1], (2 * substeps + 1, _N_DISTURBANCE)
+    commands, bars, d = (
+        np.array(np.broadcast_to(np.asarray(value, dtype=np.float64), (*shape, *size))).reshape(-1, *size)
+        for value, size in ((command, (N_INPUT,)), (bar, (_PLANT,)), (disturbance, nodes))
     )
     bar_plants, bar_commands = np.empty_like(bars), np.empty_like(commands)
     _step_vjp_rows(
@@ -348,6 +367,7 @@ def step_vjp(
         params.coefficients(),
         substeps,
         duration / substeps,
+        d,
         bars,
         bar_plants,
         bar_commands,

@@ -4,9 +4,9 @@ Who is heard, how old a message is, who is sensed in which slot and who flies ar
 """
 
 import numpy as np
+from control_period import control_period
 
 from quad_envs.constraints import TOLERANCE, constraint_scales, constraint_values
-from quad_envs.dynamics import simulate
 from quad_envs.observations.team import COMM_OFFSET, COMM_POSITION
 from quad_envs.reward import stage_cost
 from quad_envs.rotations import rotation_body_from_inertial
@@ -31,12 +31,8 @@ class TeamTwin:
     def advance(self, t, plants, commands, previous):
         """Plants after step t, rewards and costs with `kept` as the distance to keep."""
         record, n = self.steps[t].record, self.flights.n
-        h, places, after = self.task.dt / self.options.substeps, [], plants
-        for _ in range(self.options.substeps):
-            after = simulate(
-                after, commands, self.task.params, force_max=self.task.force_max, duration=h, substeps=1
-            )
-            places.append(after[:, :3])
+        flown = control_period(plants, commands, self.task, self.options.substeps, record.disturbances)
+        places, after = [one[:, :3] for one in flown], flown[-1]
         loss = stage_cost(after, record.wanted, commands, self.task.hover_force, self.task.weights)
         values = constraint_values(after, commands, previous, self.task.limits, self.task.dt)
         scales = constraint_scales(self.task.limits, self.task.dt)

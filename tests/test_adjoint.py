@@ -3,7 +3,9 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from control_period import control_period
 
+from baselines.training.flights import DifferentiableFlights
 from quad_envs.adjoint import SCRATCH_ROWS, step_vjp
 from quad_envs.dynamics import simulate
 from quad_envs.envs.shared.task_vector import task_vector
@@ -48,6 +50,37 @@ def test_the_adjoint_of_the_step_is_its_derivative(substeps, drag):
     bar_plant, bar_command = step_vjp(plants, commands, bar, params, substeps=substeps)
     assert np.allclose(bar_plant, differences(lambda x: value(x, commands), plants), atol=1e-7)
     assert np.allclose(bar_command, differences(lambda u: value(plants, u), commands), atol=1e-7)
+
+
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_a_force_acts_through_the_attitude(substeps):
+    plants, commands, rng = random_plants()
+    task = gym.make("quad/HelixTracking-v0").unwrapped.task
+    air = np.array([0.05, 0.05, 0.02, 2.0, 2.0, 2.0]) * rng.normal(size=(30, 2 * substeps + 1, 6))
+    bar = rng.normal(size=plants.shape)
+
+    def value(x, u):
+        return (control_period(x, u, task, substeps, air)[-1] * bar).sum(axis=1)
+
+    given = {"force_max": task.force_max, "duration": task.dt, "substeps": substeps}
+    bar_plant, bar_command = step_vjp(plants, commands, bar, task.params, **given, disturbance=air)
+    assert np.allclose(bar_plant, differences(lambda x: value(x, commands), plants), atol=1e-7)
+    assert np.allclose(bar_command, differences(lambda u: value(plants, u), commands), atol=1e-7)
+    calm, _ = step_vjp(plants, commands, bar, task.params, **given)
+    assert np.abs(bar_plant - calm)[:, 6:9].max() > 1e-3  # what is left out without it
+    assert not np.allclose(bar_plant, calm, atol=1e-5)
+
+
+def test_a_vehicle_in_gusts_is_taken_back_as_it_flew():
+    """Along its flight, the plants and rewards of the environment are those of the readable equations."""
+    env = gym.make("quad/HelixTracking-v0", disturbance="varied-gusts", substeps=2)
+    flights = DifferentiableFlights(env.unwrapped.options, 6, 0)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        record = flights.advance((0.1 * rng.normal(size=(6, 4))).astype(np.float32))
+        flown = control_period(record.plants, record.commands, flights.task, 2, record.disturbances)[-1]
+        assert np.allclose(flown, record.after, atol=1e-9)
+    assert np.abs(record.disturbances).max() > 0.05
 
 
 def test_a_saturated_command_has_no_influence():
@@ -128,7 +161,7 @@ def test_the_adjoint_of_a_step_with_its_reward_is_the_derivative_of_both():
     tracking_vjp_rows(
         plants, commands, previous, simulate(plants, commands, params, force_max=force_max), references,
         np.zeros(20, dtype=np.bool_), np.tile(force_max, (20, 1)), np.tile(params.coefficients(), (20, 1)),
-        task, bars, bar_rewards, 0.0, *found, np.zeros((SCRATCH_ROWS + 4, 16)),
+        np.zeros((20, 11, 6)), task, bars, bar_rewards, 0.0, *found, np.zeros((SCRATCH_ROWS + 4, 16)),
     )  # fmt: skip
     assert np.allclose(found[0], differences(lambda x: value(x, commands, previous), plants), atol=1e-6)
     assert np.allclose(found[1], differences(lambda u: value(plants, u, previous), commands), atol=1e-6)

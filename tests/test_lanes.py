@@ -8,6 +8,7 @@ import llvmlite.binding as llvm
 import numba
 import numpy as np
 import pytest
+from control_period import control_period
 from drawn import errors, gusts
 from gymnasium.utils import seeding
 
@@ -24,9 +25,7 @@ from quad_envs.dynamics import (
     LARGEST,
     arrive,
     calm_substep,
-    derivative_reference,
     disturbed_substep,
-    rotor_limits,
 )
 from quad_envs.envs.shared.random_vehicles import drawn_vehicles, random_vehicles
 from quad_envs.envs.shared.task_vector import task_vector
@@ -54,34 +53,16 @@ FORCE, TORQUE = (0.4, -0.3, 0.2), (0.002, -0.001, 0.001)
 
 
 class Twin:
-    """n flights of a task in readable equations: RK4 with exact sines, rotors that lag in closed form."""
+    """n flights of a task in readable equations."""
 
     def __init__(self, task, substeps, plants, force=(0.0, 0.0, 0.0), torque=(0.0, 0.0, 0.0)):
         self.task, self.substeps = task, substeps
-        self.air = np.broadcast_to([*torque, *force], (2 * substeps + 1, 1, 6))  # at the stage times
+        self.air = np.broadcast_to([*torque, *force], (1, 2 * substeps + 1, 6))  # at the stage times
         self.plants, self.command = plants.copy(), np.full((len(plants), 4), task.hover_force)
 
     def fly(self, commands):
         """Plants after a control period."""
-        task, h = self.task, self.task.dt / self.substeps
-        x, F = self.plants[:, :12], self.plants[:, 12:]
-        target = np.clip(commands, 0.0, rotor_limits(task.force_max, task.params))
-
-        def slope(state, forces, node):
-            torque, force = np.split(self.air[node], 2, axis=-1)
-            return derivative_reference(state, forces, task.params, torque, force)
-
-        def lagged(time):
-            return target + (F - target) * np.exp(-task.params.rotor_rate * time)
-
-        for s in range(self.substeps):
-            half, whole = lagged(0.5 * h), lagged(h)
-            k_1 = slope(x, F, 2 * s)
-            k_2 = slope(x + 0.5 * h * k_1, half, 2 * s + 1)
-            k_3 = slope(x + 0.5 * h * k_2, half, 2 * s + 1)
-            k_4 = slope(x + h * k_3, whole, 2 * s + 2)
-            x, F = x + h / 6.0 * (k_1 + 2.0 * k_2 + 2.0 * k_3 + k_4), whole
-        return np.concatenate([x, F], axis=1)
+        return control_period(self.plants, commands, self.task, self.substeps, self.air)[-1]
 
     def step(self, actions, row, lost):
         """Move, and judge against a row of the reference: reward, stage cost, cost, crashed."""
@@ -155,7 +136,7 @@ def test_gusts_and_noise_in_lanes_are_the_readable_ones_over_random_episodes_wit
                 air[i] = gusts(keys[i], steps, 2 * substeps + 1, keep, wind.size())
                 twins[i], since[i] = Twin(task, substeps, env.unwrapped.state[i : i + 1]), 0
             else:
-                twins[i].air = air[i][since[i]][:, None]
+                twins[i].air = air[i][since[i]][None]
                 since[i] += 1
                 reward, _, _, crashed = twins[i].step(actions[i : i + 1], table[since[i]], 6.0)
                 assert reward[0] == pytest.approx(rewards[i], rel=1e-8, abs=1e-10) and crashed[0] == down[i]

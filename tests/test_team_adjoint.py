@@ -28,6 +28,9 @@ RANDOM_TEAMS = {
         vehicles=4, graph=Switching(("chain", "star"), dwell_steps=4), start=CLOSE[:4], drop_out=0.2,
         substeps=3,
     ),
+    "gusts": FormationOptions(
+        vehicles=3, formation="triangle", start=CLOSE[:3], disturbance="varied-gusts", substeps=2,
+    ),
     "target": TargetTrackingOptions(start=(*CLOSE, (3.0, 0.0, 0.0)), delay=1, substeps=2, drop_out=0.2),
 }  # fmt: skip
 

@@ -1,9 +1,8 @@
 """Tracking flights as a differentiable function of the actions.
 
 The forward pass is the environments' compiled step: resets, disturbances, sensor noise and other vehicles
-included. The backward pass is its adjoint, which neglects disturbances: a force acts on velocities in body
-axes through the attitude, as the weight does, and that part of the derivative is left out. A flight that ends
-begins anew in the same step, and no gradient passes through that.
+included. The backward pass is its adjoint, in which disturbances and errors of sensors are given. A flight
+that ends begins anew in the same step, and no gradient passes through that.
 """
 
 from __future__ import annotations
@@ -47,6 +46,7 @@ class Record(NamedTuple):
     crashed: Bools  # (n,)
     force_max: Array  # (n, 4), N
     coefficients: Array  # (n, N_COEFFICIENTS)
+    disturbances: Array  # (n, 2 substeps + 1, 6), at its stage times
     slopes: Array  # (n, 4), of the commands by the actions
     rewards: Array  # (n,)
     done: Bools  # (n,), flights that began anew
@@ -131,7 +131,7 @@ class DifferentiableFlights:
         """One step of all flights; those that end begin anew."""
         vehicles, references = self.batch.vehicles, self.batch.references
         plants, previous = vehicles.read(PLANT, N_PLANT), vehicles.read(COMMAND, N_INPUT)
-        axes, yaw = self._axes_and_yaw()
+        axes, yaw, disturbances = *self._axes_and_yaw(), self.batch.coming_disturbances()
         self.batch.step(np.ascontiguousarray(actions).reshape(-1), self._out.reshape(-1), self._told)
         scores = scores_of(self._told.copy())
         slopes = np.empty((self.n, 4))
@@ -148,6 +148,7 @@ class DifferentiableFlights:
             crashed=scores.crashed,
             force_max=vehicles.read(FORCE_MAX, N_INPUT),
             coefficients=vehicles.read(COEFFICIENTS, N_COEFFICIENTS),
+            disturbances=disturbances,
             slopes=slopes,
             rewards=scores.reward,
             done=done,
@@ -177,7 +178,7 @@ class DifferentiableFlights:
         flew_on = ~record.done[:, None]
         plants, commands, previous = np.empty((self.n, 16)), np.empty((self.n, 4)), np.empty((self.n, 4))
         tracking_vjp_rows(
-            *record[:8], self._vector, bar_after * flew_on, bar_rewards, np.float64(bar_cost),
+            *record[:9], self._vector, bar_after * flew_on, bar_rewards, np.float64(bar_cost),
             plants, commands, previous,
             self._scratch,
         )  # fmt: skip

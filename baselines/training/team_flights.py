@@ -1,9 +1,9 @@
 """Flights of teams as a differentiable function of the actions of all vehicles.
 
 The forward pass is the environments' compiled step: resets, disturbances and sensor noise included. The
-backward pass is its adjoint without the last two, in which sensitivities pass between vehicles by rewards,
-by what is sensed and by messages, back to the step in which these were sent. No gradient passes through a
-new beginning.
+backward pass is its adjoint, in which the last two are given, and sensitivities pass between vehicles by
+rewards, by what is sensed and by messages, back to the step in which these were sent. No gradient passes
+through a new beginning.
 """
 
 from __future__ import annotations
@@ -132,6 +132,7 @@ class DifferentiableTeams:
             self.batch.ages(),
             vehicles.read(ALIVE) > 0.0,
         )
+        disturbances = self.batch.coming_disturbances()
         self.batch.step(np.ascontiguousarray(actions).reshape(-1), self._out.reshape(-1), self._told)
         scores = self.batch.scores(self._told.copy())
         slopes = np.empty((self.n, N_INPUT))
@@ -148,6 +149,7 @@ class DifferentiableTeams:
             crashed=scores.crashed,
             force_max=vehicles.read(FORCE_MAX, N_INPUT),
             coefficients=vehicles.read(COEFFICIENTS, N_COEFFICIENTS),
+            disturbances=disturbances,
         )
         self._seen = self._observer.see(self._out)
         self._cut -= 1

@@ -74,3 +74,17 @@ def draw_ahead(
         draw(draws.keys[i], step, _ERRORS, drawn[:_ERROR_NUMBERS])
         for c in range(N_STATE):
             errors[c] = draws.deviations[c] * drawn[c]
+
+
+def coming(draws: Draws, disturbances: Array, which: IntArray, steps: IntArray) -> Array:
+    """Disturbances at the stage times of the control period that begins now, (n, 2 substeps + 1, 6).
+
+    Args:
+        draws: The draws.
+        disturbances: Tables, (m, T, 2 substeps + 1, 6); the coming period alone where there are gusts.
+        which: Table of each vehicle, (n,).
+        steps: Control steps since its reset, (n,).
+    """
+    if disturbances.shape[1] == 0:
+        return np.zeros((len(which), *disturbances.shape[2:]))
+    return np.asarray(disturbances[which, 0 if draws.gusty else steps])

@@ -70,6 +70,7 @@ class TeamRecord(NamedTuple):
     crashed: Bools  # (n,), who crashed in it: its reward is 0 and leads nowhere
     force_max: Array  # (n, 4), N
     coefficients: Array  # (n, N_COEFFICIENTS)
+    disturbances: Array  # (n, 2 substeps + 1, 6), at its stage times
 
 
 class TeamScratch(NamedTuple):
@@ -270,7 +271,7 @@ def advance_teams_vjp(
             if record.flew[r]:
                 roll_out(
                     record.plants[r], record.commands[r], record.force_max[r], record.coefficients[r],
-                    substeps, h, scratch.past[i], scratch.stages,
+                    substeps, h, record.disturbances[r], scratch.past[i], scratch.stages,
                 )  # fmt: skip
                 for k in range(record.after.shape[1]):
                     scratch.past[i, substeps, k] = record.after[r, k]
@@ -309,8 +310,8 @@ def _fly_back(
         for c in range(N_PLANT):
             bar[c] += scratch.bars[i, s + 1, c]
         roll_back(
-            scratch.past[i, s], record.commands[r], record.force_max[r], record.coefficients[r], h, bar,
-            bar_commands[r], scratch.stages,
+            scratch.past[i, s], record.commands[r], record.force_max[r], record.coefficients[r], h,
+            record.disturbances[r, 2 * s : 2 * s + 3], bar, bar_commands[r], scratch.stages,
         )  # fmt: skip
     forget_saturated(record.commands[r], record.force_max[r], bar_commands[r])
     for c in range(N_INPUT):

@@ -37,7 +37,7 @@ from ...sensors import sensor_rows
 from ...table_row import N_PREVIEW, N_TABLE
 from ...targets import N_TARGET, make_target
 from ...tasks import TeamTask
-from ..shared.draws import gusts_in_flight, make_draws
+from ..shared.draws import coming, gusts_in_flight, make_draws
 from ..shared.given import given_plants
 from ..shared.packed_batch import PackedBatch
 from ..shared.random_vehicles import random_vehicles
@@ -316,6 +316,11 @@ class TeamBatch(PackedBatch):
         ages = self.vehicles.read(STEP)[:, None] - head[..., SENT]
         valid = (head[..., WEIGHT] > 0.0) & (ages <= self._arrays.team[LIFETIME])
         return np.where(valid, ages, -1.0).astype(np.int64)
+
+    def coming_disturbances(self) -> Array:
+        """Of each vehicle, at the stage times of the control period that begins, (n, 2 substeps + 1, 6)."""
+        steps = self.vehicles.read(STEP).astype(np.int64)
+        return coming(self._arrays.draws, self.disturbances, self._which[DISTURBANCE], steps)
 
     @property
     def arrays(self) -> Teams:

@@ -157,6 +157,7 @@ def tracking_vjp_rows(
     crashed: NDArray[np.bool_],
     force_max: Array,
     coefficients: Array,
+    disturbances: Array,
     task: Array,
     bars: Array,
     bar_rewards: Array,
@@ -177,6 +178,7 @@ def tracking_vjp_rows(
         crashed: (n,), flights that ended in a crash: their reward is 0 and leads nowhere.
         force_max: Rotor saturation of each, (n, 4), N.
         coefficients: Of each, (n, N_COEFFICIENTS).
+        disturbances: At the stage times of the step, (n, 2 substeps + 1, 6).
         task: Task vector.
         bars: Sensitivity to the plants afterwards, (n, 16).
         bar_rewards: Sensitivity to the rewards, (n,).
@@ -205,7 +207,7 @@ def tracking_vjp_rows(
         for i in range(12, 16):
             total[i] = bars[j, i]
         step_vjp_kernel(
-            plants[j], commands[j], force_max[j], coefficients[j], substeps, h, total,
+            plants[j], commands[j], force_max[j], coefficients[j], substeps, h, disturbances[j], total,
             bar_plants[j], bar_commands[j], scratch,
         )  # fmt: skip
         for i in range(4):

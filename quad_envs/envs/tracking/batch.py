@@ -13,7 +13,7 @@ from ...compilation.decorators import DirectEntry, entry_of
 from ...compilation.packed import IntArray, pack
 from ...compilation.threads import Threads
 from ...disturbances import Disturbance
-from ...lanes import LANES, N_PLANT, N_TRACKING, Blocks
+from ...lanes import LANES, N_PLANT, N_TRACKING, STEP, Blocks
 from ...names import shown
 from ...normals import key_of
 from ...observations.tracking import tabulate_previews
@@ -21,7 +21,7 @@ from ...plant import N_STATE, POSITION, Array
 from ...references import RandomSmooth, Reference, make_reference, state_on
 from ...table_row import N_PREVIEW, N_TABLE
 from ...tasks import Task
-from ..shared.draws import gusts_in_flight, make_draws
+from ..shared.draws import coming, gusts_in_flight, make_draws
 from ..shared.given import given_plants
 from ..shared.packed_batch import PackedBatch
 from ..shared.random_vehicles import random_vehicles
@@ -140,6 +140,11 @@ class TrackingBatch(PackedBatch):
     def scores(self, told: Array) -> Scores:
         """What is told there."""
         return scores_of(told)
+
+    def coming_disturbances(self) -> Array:
+        """Of each flight, at the stage times of the control period that begins, (n, 2 substeps + 1, 6)."""
+        steps = self.vehicles.read(STEP).astype(np.int64)
+        return coming(self._arrays.draws, self.disturbances, self.which[1], steps)
 
     def begin(
         self,
