@@ -1,9 +1,7 @@
 """Dual active set of Goldfarb and Idnani (1983), with the multipliers of soft rows kept in [0, weight].
 
-Rows a_p'u >= b_p are numbered: 4N each of u >= lower, u <= upper, rate from below, rate from above; then
-the lower sides of the K state rows, then their upper sides. A row is inactive, working (an equality of the
-current face) or saturated: violated with its multiplier at the weight, which makes it a constant in the
-gradient. So an exact L1 penalty needs no slack variable.
+The rows are those of `rows.py`. A saturated one is a constant in the gradient, so an exact L1 penalty needs
+no slack variable.
 
 With q working normals N_W the kernels keep J = [J_1 J_2] with J J' = H^-1, J_2'N_W = 0, and the triangular
 R with J_1'N_W = R, both stored by columns (J_T[k] is column k). A loop that starts at max(start, 0) tells the
@@ -15,200 +13,47 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from quad_envs.compilation.decorators import kernel
-from quad_envs.parameters import N_INPUT, Array
+from quad_envs.parameters import Array
 
 from .ocp import IntArray
-from .products import add_matvec_transposed
 from .recursion import step_plan
-
-ByteArray = NDArray[np.int8]
+from .rows import INACTIVE, SATURATED, WORKING, ByteArray, RowData, load_normal, worst_row
 
 OPTIMAL, INFEASIBLE, ITERATION_LIMIT, NOT_FINITE, INACCURATE = range(
     5
 )  # the members of Status, for compiled code
-ROW_TOLERANCE = 1e-9  # in the units of the row
 N_VECTORS = 9  # rows of the scratch array `vectors`
-INACTIVE, WORKING, SATURATED = range(3)  # states of a row
 _DEPENDENT = 1e-22  # |J_2'a|^2 over |J'a|^2 below which a normal lies in the span of the working ones
 _NO_DIRECTION = 1e-13  # smallest multiplier direction that counts
 
 
-class RowData(NamedTuple):
-    """All rows of one problem, for compiled code."""
+class Dynamics(NamedTuple):
+    """x_{i+1} = A_i x_i + B_i u_i + c_i."""
 
-    lower: Array  # (4,), input box
-    upper: Array  # (4,)
-    rate_step: float  # N per sample
-    first_move: Array  # (2, 4), bounds of the rate rows on u_0
-    normals: Array  # (H, 12)
-    normal: IntArray  # (K,)
-    stage: IntArray  # (K,)
-    row_lower: Array  # (K,)
-    row_upper: Array  # (K,)
-    weight: Array  # (K,)
-    spans: IntArray  # (K, 2), as left by `row_spans`
+    A: Array  # (1 or N, 12, 12)
+    B: Array  # (1 or N, 12, 4)
+    c: Array  # (N, 12)
+    transposed: Array  # (1 or N, 16, 12), [A_i B_i]'
 
 
-@kernel
-def row_spans(normals: Array, spans: IntArray) -> None:
-    """First and one past the last non-zero entry of each normal: most state rows read one or three states."""
-    for h in range(normals.shape[0]):
-        start = normals.shape[1]
-        stop = 0
-        for a in range(normals.shape[1]):
-            if normals[h, a] != 0.0:
-                start = min(start, a)
-                stop = a + 1
-        spans[h, 0] = start
-        spans[h, 1] = stop
+class Face(NamedTuple):
+    """A plan, the rows that hold it, and the factors; all changed in place."""
+
+    u: Array  # (N, 4)
+    x: Array  # (N+1, 12)
+    J_T: Array  # (4N, 4N), inverse factor of the Hessian by columns, rotated by the working rows
+    R_T: Array  # (4N, 4N), its first q columns count
+    active: IntArray  # (4N + 1,), the working rows
+    state: ByteArray  # (16N + 2K,), of every row
+    vectors: Array  # (N_VECTORS, 4N + 12), scratch; 3, 4, 5 are sign, multiplier and cap of the working rows
 
 
 @kernel
-def _worst_input_row(u: Array, rows: RowData, state: ByteArray) -> tuple[int, float]:
-    """The inactive box or rate row with the most negative slack; (-1, -tolerance) if there is none."""
-    N, m = u.shape
-    nv = N * m
-    lower, upper, first_move, rate_step = rows.lower, rows.upper, rows.first_move, rows.rate_step
-    worst = -ROW_TOLERANCE
-    row = -1
-    for i in range(N):
-        for a in range(m):
-            k = m * i + a
-            value = u[i, a]
-            slack = value - lower[a]
-            if slack < worst and state[k] == INACTIVE:
-                worst, row = slack, k
-            slack = upper[a] - value
-            if slack < worst and state[nv + k] == INACTIVE:
-                worst, row = slack, nv + k
-            if i == 0:
-                below = value - first_move[0, a]
-                above = first_move[1, a] - value
-            else:
-                below = value - u[i - 1, a] + rate_step
-                above = u[i - 1, a] + rate_step - value
-            if below < worst and state[2 * nv + k] == INACTIVE:
-                worst, row = below, 2 * nv + k
-            if above < worst and state[3 * nv + k] == INACTIVE:
-                worst, row = above, 3 * nv + k
-    return row, worst
-
-
-@kernel
-def _worst_state_row(
-    x: Array, rows: RowData, base: int, state: ByteArray, row: int, worst: float
-) -> tuple[int, float]:
-    """As above among the state rows, where a saturated row that is satisfied counts too; ids from base."""
-    normals, normal, stage, spans = rows.normals, rows.normal, rows.stage, rows.spans
-    row_lower, row_upper, weight = rows.row_lower, rows.row_upper, rows.weight
-    K = normal.shape[0]
-    for k in range(K):
-        h = normal[k]
-        value = 0.0
-        for a in range(spans[h, 0], spans[h, 1]):
-            value += normals[h, a] * x[stage[k], a]
-        for side in range(2):
-            slack = value - row_lower[k] if side == 0 else row_upper[k] - value
-            p = base + side * K + k
-            if state[p] == SATURATED:
-                slack = -slack
-            if slack < worst and state[p] != WORKING and weight[k] > 0.0:
-                worst, row = slack, p
-    return row, worst
-
-
-@kernel
-def worst_row(u: Array, x: Array, rows: RowData, state: ByteArray) -> tuple[int, float]:
-    """The row to work on next and its slack, or -1 if the plan (u, x) is optimal."""
-    row, slack = _worst_input_row(u, rows, state)
-    if rows.normal.shape[0] == 0:
-        return row, slack
-    return _worst_state_row(x, rows, 4 * u.size, state, row, slack)
-
-
-@kernel
-def row_slack(p: int, u: Array, x: Array, rows: RowData) -> float:
-    """a_p'u - b_p of any row."""
-    m, nv, K = u.shape[1], u.size, rows.normal.shape[0]
-    value, bound = 0.0, 0.0
-    if p >= 4 * nv:
-        k = (p - 4 * nv) % K
-        h = rows.normals[rows.normal[k]]
-        for a in range(h.shape[0]):
-            value += h[a] * x[rows.stage[k], a]
-        below = p < 4 * nv + K
-        bound = rows.row_lower[k] if below else rows.row_upper[k]
-        return float(value - bound) if below else float(bound - value)
-    i, a = (p % nv) // m, p % m
-    below = (p // nv) % 2 == 0
-    value = u[i, a]
-    if p < 2 * nv:
-        bound = rows.lower[a] if below else rows.upper[a]
-    elif i == 0:
-        bound = rows.first_move[0, a] if below else rows.first_move[1, a]
-    else:
-        value -= u[i - 1, a]
-        bound = -rows.rate_step if below else rows.rate_step
-    return float(value - bound) if below else float(bound - value)
-
-
-@kernel
-def _input_normal(p: int, nv: int, a: Array) -> tuple[int, int]:
-    """Normal of a box or rate row into a; returns the range of whole stages outside which it is zero."""
-    m = N_INPUT
-    k = p % nv
-    kind = p // nv
-    stop = m * (k // m + 1)
-    start = max(stop - m, 0) if kind < 2 else max(stop - 2 * m, 0)
-    for j in range(start, stop):
-        a[j] = 0.0
-    sign = 1.0 if kind % 2 == 0 else -1.0
-    a[k] = sign
-    if kind >= 2 and k >= m:
-        a[k - m] = -sign
-    return start, stop
-
-
-@kernel
-def _state_normal(
-    h: Array, stage: int, sign: float, A: Array, B: Array, y: Array, A_y: Array, a: Array
-) -> int:
-    """Normal of the row sign h'x_stage into a: a_i = B_i'y, y <- A_i'y backwards; returns its length."""
-    n, m = int(B.shape[1]), int(B.shape[2])
-    for b in range(n):
-        y[b] = sign * h[b]
-    for i in range(stage - 1, -1, -1):
-        j = i if A.shape[0] > 1 else 0
-        block = a[m * i : m * (i + 1)]
-        for b in range(m):
-            block[b] = 0.0
-        add_matvec_transposed(B[j], y, 1.0, block)
-        if i > 0:
-            for b in range(n):
-                A_y[b] = 0.0
-            add_matvec_transposed(A[j], y, 1.0, A_y)
-            for b in range(n):
-                y[b] = A_y[b]
-    return m * stage
-
-
-@kernel
-def load_normal(
-    p: int, sign: float, A: Array, B: Array, rows: RowData, nv: int, vectors: Array
-) -> tuple[int, int]:
-    """The normal of any row, times sign for state rows, into vectors[6]; the range outside which it is 0."""
-    a = vectors[6]
-    if p < 4 * nv:
-        return _input_normal(p, nv, a)
-    K = rows.normal.shape[0]
-    k = (p - 4 * nv) % K
-    side = 1.0 if p < 4 * nv + K else -1.0
-    h = rows.normals[rows.normal[k]]
-    return 0, _state_normal(h, rows.stage[k], side * sign, A, B, vectors[0, :12], vectors[1, :12], a)
+def roll_out(model: Dynamics, u: Array, x: Array) -> None:
+    """The states of a plan, from x[0] on."""
+    for i in range(u.shape[0]):
+        step_plan(model.transposed, model.c, i, u, x)
 
 
 @kernel
@@ -319,17 +164,10 @@ def _rotate(v: Array, w: Array, cos: float, sin: float) -> None:
 
 
 @kernel
-def remove_row(
-    J_T: Array,
-    R_T: Array,
-    active: IntArray,
-    sign: Array,
-    nu: Array,
-    cap: Array,
-    leaving: int,
-    q: int,
-) -> None:
+def remove_row(face: Face, leaving: int, q: int) -> None:
     """Takes working row `leaving` out; entry q (the row on its way in) moves to q - 1. R stays triangular."""
+    J_T, R_T, active, vectors = face.J_T, face.R_T, face.active, face.vectors
+    sign, nu, cap = vectors[3], vectors[4], vectors[5]
     for j in range(leaving, q):
         active[j], sign[j], nu[j], cap[j] = active[j + 1], sign[j + 1], nu[j + 1], cap[j + 1]
     for j in range(leaving, q - 1):
@@ -359,29 +197,20 @@ def move_along(u: Array, z: Array, t: float) -> None:
 
 @kernel
 def _enter(
-    J_T: Array,
-    R_T: Array,
-    a: Array,
-    a_start: int,
-    a_stop: int,
-    slack: float,
-    u: Array,
-    state: ByteArray,
-    active: IntArray,
-    vectors: Array,
-    q: int,
-    iterations: int,
-    iteration_limit: int,
+    face: Face, start: int, stop: int, slack: float, q: int, iterations: int, iteration_limit: int
 ) -> tuple[int, int, int]:
     """Brings the row stored as entry q into the working set, or saturates or releases it.
+
+    Its normal is in vectors[6], zero outside start..stop.
 
     Returns:
         The new q, the iteration count, and OPTIMAL (done with this row), INFEASIBLE or ITERATION_LIMIT.
     """
+    J_T, R_T, active, state, vectors = face.J_T, face.R_T, face.active, face.state, face.vectors
     d, z, r, sign, nu, cap = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4], vectors[5]
     while iterations < iteration_limit:
         iterations += 1
-        length = project(J_T, a, a_start, a_stop, d)
+        length = project(J_T, vectors[6], start, stop, d)
         zeta = primal_direction(J_T, d, q, z)
         solve_triangle(R_T, d, q, r)
         dual, leaving, at_cap = _first_to_leave(nu, r, cap, q)
@@ -395,7 +224,7 @@ def _enter(
             nu[i] -= t * r[i]
         nu[q] += t
         if primal:
-            move_along(u, z, t)
+            move_along(face.u, z, t)
             slack += t * zeta
         if full <= dual and full <= own:
             append_row(J_T, R_T, d, q)
@@ -406,99 +235,69 @@ def _enter(
             state[active[q]] = inactive_after(sign[q] > 0.0)
             return q, iterations, OPTIMAL
         state[active[leaving]] = inactive_after(at_cap == (sign[leaving] > 0.0))
-        remove_row(J_T, R_T, active, sign, nu, cap, leaving, q)
+        remove_row(face, leaving, q)
         q -= 1
     return q, iterations, ITERATION_LIMIT
 
 
 @kernel
 def dual_active_set(
-    A: Array,
-    B: Array,
-    c: Array,
-    transposed: Array,
+    model: Dynamics,
     rows: RowData,
+    face: Face,
     row: int,
     slack: float,
     q: int,
     iterations: int,
     iteration_limit: int,
-    u: Array,
-    x: Array,
-    J_T: Array,
-    R_T: Array,
-    active: IntArray,
-    state: ByteArray,
-    vectors: Array,
 ) -> tuple[int, int, int]:
-    """From the optimum u of a face, at first the unconstrained one, to the constrained one.
+    """From the optimum of a face, at first the unconstrained one, to the constrained one.
 
     Args:
-        A: (1 or N, 12, 12).
-        B: (1 or N, 12, 4).
-        c: (N, 12).
-        transposed: [A_i B_i]', (1 or N, 16, 12).
+        model: The dynamics.
         rows: The rows of the problem.
+        face: The optimum of a face with q working rows on entry, the result on exit.
         row: The first row to work on, as `worst_row` gives it.
         slack: Its slack.
         q: Number of working rows, 0 at the unconstrained optimum.
         iterations: Steps done before.
         iteration_limit: Largest number of steps, those before included.
-        u: Inputs, (N, 4); the optimum of the face on entry, the result on exit.
-        x: Its states, (N+1, 12), likewise.
-        J_T: Inverse factor of the Hessian by columns, (4N, 4N); destroyed.
-        R_T: Overwritten behind its first q columns, (4N, 4N).
-        active: The working rows, (4N + 1,).
-        state: State of every row, (16N + 2K,).
-        vectors: Scratch (N_VECTORS, 4N + 12); 3, 4, 5 are sign, multiplier and cap of the working rows.
 
     Returns:
         OPTIMAL, INFEASIBLE or ITERATION_LIMIT, the number of steps, and q.
     """
-    N = u.shape[0]
-    nv = u.size
-    K = rows.normal.shape[0]
+    u, x, active, state, vectors = face.u, face.x, face.active, face.state, face.vectors
+    nv, K = u.size, rows.normal.shape[0]
     base = 4 * nv
-    a, sign, nu, cap = vectors[6], vectors[3], vectors[4], vectors[5]
+    sign, nu, cap = vectors[3], vectors[4], vectors[5]
     status = OPTIMAL
     while row >= 0:
         active[q] = row
         nu[q] = 0.0
         sign[q] = -1.0 if state[row] == SATURATED else 1.0
         cap[q] = rows.weight[(row - base) % K] if row >= base else math.inf
-        a_start, a_stop = load_normal(row, sign[q], A, B, rows, nv, vectors)
-        q, iterations, status = _enter(
-            J_T, R_T, a, a_start, a_stop, slack, u, state, active, vectors, q, iterations, iteration_limit
-        )
+        start, stop = load_normal(row, sign[q], model.A, model.B, rows, nv, vectors)
+        q, iterations, status = _enter(face, start, stop, slack, q, iterations, iteration_limit)
         if status != OPTIMAL:
             break
         if K > 0:
             # Input rows first and state rows only when none is left would save the roll-out here, but takes
             # twice the steps where many state rows are saturated.
-            for i in range(N):
-                step_plan(transposed, c, i, u, x)
+            roll_out(model, u, x)
         row, slack = worst_row(u, x, rows, state)
-    for i in range(N):
-        step_plan(transposed, c, i, u, x)
+    roll_out(model, u, x)
     return status, iterations, q
 
 
 @kernel
-def collect_multipliers(
-    state: ByteArray,
-    active: IntArray,
-    sign: Array,
-    nu: Array,
-    cap: Array,
-    weight: Array,
-    q: int,
-    base: int,
-    multipliers: Array,
-) -> None:
-    """Multiplier of every working and saturated row: counted up from 0 or down from the cap, or the cap."""
-    K = weight.shape[0]
+def collect_multipliers(face: Face, weight: Array, q: int, multipliers: Array) -> None:
+    """Multiplier of every row: counted up from 0 or down from the cap, the cap of a saturated one, or 0."""
+    sign, nu, cap = face.vectors[3], face.vectors[4], face.vectors[5]
+    K, base = weight.shape[0], 4 * face.u.size
+    for k in range(base + 2 * K):
+        multipliers[k] = 0.0
     for k in range(2 * K):
-        if state[base + k] == SATURATED:
+        if face.state[base + k] == SATURATED:
             multipliers[base + k] = weight[k % K]
     for i in range(q):
-        multipliers[active[i]] = nu[i] if sign[i] > 0.0 else cap[i] - nu[i]
+        multipliers[face.active[i]] = nu[i] if sign[i] > 0.0 else cap[i] - nu[i]

@@ -11,10 +11,10 @@ import math
 from quad_envs.compilation.decorators import kernel
 from quad_envs.parameters import Array
 
-from .active_set import RowData
 from .linalg import fill
 from .ocp import OcpQp, weight_of_changes
 from .products import add_matvec_transposed
+from .rows import RowData
 
 REFINED = 1e-9  # relative stationarity above which a solution is refined once
 STATIONARY = 1e-8  # and above which it is not called optimal: 1e-6 less what another order of summation adds
@@ -99,6 +99,26 @@ def _pull_of_changes(S: Array, u_last: Array, u: Array, i: int, a: int) -> tuple
 
 
 @kernel
+def _pull_of_states(qp: OcpQp, x: Array, force: Array, gradient: Array, scratch: Array) -> None:
+    """B_i' y_{i+1} into gradient, for the costate `y_i = Q_i (x_i - r_i) + A_i' y_{i+1} - force_i`."""
+    A, B, Q = qp.A, qp.B, qp.Q
+    (N, n), m = qp.c.shape, B.shape[2]
+    difference = scratch[2]
+    for i in range(N, 0, -1):
+        y, y_next = scratch[i % 2], scratch[1 - i % 2]
+        for a in range(n):
+            difference[a] = x[i, a] - qp.r[i, a]
+            y[a] = -force[i, a]
+        add_matvec_transposed(qp.Q_f if i == N else Q[i if Q.shape[0] > 1 else 0], difference, 1.0, y)
+        if i < N:
+            add_matvec_transposed(A[i if A.shape[0] > 1 else 0], y_next, 1.0, y)
+        block = gradient[m * (i - 1) : m * i]
+        for a in range(m):
+            block[a] = 0.0
+        add_matvec_transposed(B[i - 1 if B.shape[0] > 1 else 0], y, 1.0, block)
+
+
+@kernel
 def lagrangian_gradient(
     qp: OcpQp,
     transposed: Array,
@@ -126,24 +146,12 @@ def lagrangian_gradient(
     Returns:
         Its largest entry over 1 + the largest entry of its terms R_i u_i, B_i' y_{i+1} and S (u_i - u_{i-1}).
     """
-    A, B, Q, R, r, R_rate = qp.A, qp.B, qp.Q, qp.R, qp.r, weight_of_changes(qp)
+    R, R_rate = qp.R, weight_of_changes(qp)
     N, m = u.shape
     nv = N * m
-    n, x, difference = qp.x_0.shape[0], states, scratch[2]
-    _roll_out(qp.c, qp.x_0, transposed, u, x)
+    _roll_out(qp.c, qp.x_0, transposed, u, states)
     _pull_of_rows(rows, multipliers, 4 * nv, force)
-    for i in range(N, 0, -1):
-        y, y_next = scratch[i % 2], scratch[1 - i % 2]
-        for a in range(n):
-            difference[a] = x[i, a] - r[i, a]
-            y[a] = -force[i, a]
-        add_matvec_transposed(qp.Q_f if i == N else Q[i if Q.shape[0] > 1 else 0], difference, 1.0, y)
-        if i < N:
-            add_matvec_transposed(A[i if A.shape[0] > 1 else 0], y_next, 1.0, y)
-        block = gradient[m * (i - 1) : m * i]
-        for a in range(m):
-            block[a] = 0.0
-        add_matvec_transposed(B[i - 1 if B.shape[0] > 1 else 0], y, 1.0, block)
+    _pull_of_states(qp, states, force, gradient, scratch)
     scale, worst = 1.0, 0.0
     for i in range(N):
         own_weight = R[i if R.shape[0] > 1 else 0]

@@ -25,22 +25,20 @@ from .active_set import (
     INFEASIBLE,
     NOT_FINITE,
     OPTIMAL,
-    ROW_TOLERANCE,
-    ByteArray,
-    RowData,
+    Dynamics,
+    Face,
     collect_multipliers,
     dual_active_set,
     primal_direction,
     project,
-    row_slack,
-    row_spans,
-    worst_row,
+    roll_out,
 )
 from .linalg import fill
 from .ocp import IntArray, OcpQp, StateRows, rate_weight, validate, weight_of_changes
 from .products import add_product, negate, transpose
 from .rate_weight import carve_rate, rate_pass, rate_plan
-from .recursion import Feedback, Regulator, optimal_plan, riccati_pass, step_plan
+from .recursion import Feedback, Regulator, optimal_plan, riccati_pass
+from .rows import ROW_TOLERANCE, ByteArray, RowData, row_slack, row_spans, worst_row
 from .solution import Multipliers, Solution, Status
 from .stationarity import REFINED, STATIONARY, is_mild, lagrangian_gradient
 from .working_set import correct, start_from_guess
@@ -247,19 +245,26 @@ def _largest_gap(rows: RowData, q: int, ws: Workspace) -> float:
 
 
 @kernel
+def _dynamics(qp: OcpQp, ws: Workspace) -> Dynamics:
+    """After `_recursion`."""
+    return Dynamics(qp.A, qp.B, qp.c, ws.transposed[: qp.A.shape[0]])
+
+
+@kernel
+def _face(ws: Workspace) -> Face:
+    return Face(ws.u, ws.x, ws.factors[0], ws.factors[1], ws.active, ws.state, ws.vectors)
+
+
+@kernel
 def _finish(qp: OcpQp, rows: RowData, q: int, ws: Workspace) -> int:
     """Multipliers, and OPTIMAL or INACCURATE for the face reached: refined once if it is not stationary."""
-    u, x = ws.u, ws.x
-    sign, nu, cap = ws.vectors[3], ws.vectors[4], ws.vectors[5]
-    n_rows = 4 * u.size + 2 * rows.normal.shape[0]
+    u, x, face = ws.u, ws.x, _face(ws)
     relative, gap = math.inf, math.inf
     for attempt in range(2):
         if attempt == 1:
-            correct(rows, ws.gradient, u, x, ws.factors[0], ws.factors[1], ws.active, ws.vectors, q)
-            for i in range(u.shape[0]):
-                step_plan(ws.transposed[: qp.A.shape[0]], qp.c, i, u, x)
-        _clear(ws.multipliers, n_rows)
-        collect_multipliers(ws.state, ws.active, sign, nu, cap, rows.weight, q, 4 * u.size, ws.multipliers)
+            correct(rows, ws.gradient, face, q)
+            roll_out(_dynamics(qp, ws), u, x)
+        collect_multipliers(face, rows.weight, q, ws.multipliers)
         relative = _stationarity(qp, rows, ws)
         gap = _largest_gap(rows, q, ws)
         if attempt == 0 and relative <= REFINED and gap <= ROW_TOLERANCE:
@@ -278,25 +283,18 @@ def _solve_rows(
     qp: OcpQp, rows: RowData, warm: bool, iterations: int, iteration_limit: int, ws: Workspace
 ) -> tuple[int, int]:
     """From the unconstrained optimum in ws to the constrained one; with `warm` by way of ws.guess."""
-    u, x, transposed = ws.u, ws.x, ws.transposed[: qp.A.shape[0]]
-    J_T, R_T = ws.factors[0], ws.factors[1]
-    n_rows = 4 * u.size + 2 * rows.normal.shape[0]
+    model, face = _dynamics(qp, ws), _face(ws)
+    n_rows = 4 * ws.u.size + 2 * rows.normal.shape[0]
     _factor(qp, ws)
     q = 0
     ws.error[0] = math.inf
     _clear(ws.state, n_rows)
     if warm:
-        q, changes = start_from_guess(
-            qp.A, qp.B, qp.c, transposed, rows, ws.guess[:n_rows],
-            u, x, J_T, R_T, ws.active, ws.state, ws.force, ws.vectors,
-        )  # fmt: skip
+        q, changes = start_from_guess(model, rows, ws.guess[:n_rows], face, ws.force)
         iterations += changes
-    row, slack = worst_row(u, x, rows, ws.state)
-    status, iterations, q = dual_active_set(
-        qp.A, qp.B, qp.c, transposed, rows, row, slack, q, iterations, iteration_limit,
-        u, x, J_T, R_T, ws.active, ws.state, ws.vectors,
-    )  # fmt: skip
-    if not (_all_finite(u) and _all_finite(x)):
+    row, slack = worst_row(ws.u, ws.x, rows, ws.state)
+    status, iterations, q = dual_active_set(model, rows, face, row, slack, q, iterations, iteration_limit)
+    if not (_all_finite(ws.u) and _all_finite(ws.x)):
         return NOT_FINITE, iterations
     finished = _finish(qp, rows, q, ws)
     if status != OPTIMAL:

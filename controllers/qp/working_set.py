@@ -19,25 +19,22 @@ from quad_envs.compilation.decorators import kernel
 from quad_envs.parameters import N_INPUT, Array
 
 from .active_set import (
-    SATURATED,
-    WORKING,
-    ByteArray,
-    RowData,
+    Dynamics,
+    Face,
     append_row,
     inactive_after,
-    load_normal,
     move_along,
     primal_direction,
     project,
     remove_row,
-    row_slack,
+    roll_out,
     solve_triangle,
     solve_triangle_transposed,
 )
 from .linalg import fill
 from .ocp import IntArray
 from .products import add_matvec_transposed
-from .recursion import step_plan
+from .rows import SATURATED, WORKING, ByteArray, RowData, load_normal, row_slack
 
 BASE = 5
 DIGITS = 22  # 5^22 is the last power of 5 that a float64 counts up to exactly
@@ -135,21 +132,9 @@ def unpack_working_set(words: Array, stage: IntArray, counts: IntArray, guess: B
 
 
 @kernel
-def _saturate(
-    A: Array,
-    B: Array,
-    c: Array,
-    transposed: Array,
-    rows: RowData,
-    guess: ByteArray,
-    state: ByteArray,
-    u: Array,
-    x: Array,
-    J_T: Array,
-    force: Array,
-    vectors: Array,
-) -> None:
+def _saturate(model: Dynamics, rows: RowData, guess: ByteArray, face: Face, force: Array) -> None:
     """Moves u to the optimum under the constant pull of the saturated rows of the guess."""
+    A, B, u, J_T = model.A, model.B, face.u, face.J_T
     N, K = u.shape[0], rows.normal.shape[0]
     base = 4 * u.size
     found = False
@@ -158,14 +143,14 @@ def _saturate(
         weight = rows.weight[k % K]
         if guess[base + k] == SATURATED and 0.0 < weight < math.inf:
             found = True
-            state[base + k] = SATURATED
+            face.state[base + k] = SATURATED
             factor = weight if k < K else -weight
             h = rows.normals[rows.normal[k % K]]
             for a in range(h.shape[0]):
                 force[rows.stage[k % K], a] += factor * h[a]
     if not found:
         return
-    a, d, z = vectors[6], vectors[0], vectors[1]
+    a, d, z = face.vectors[6], face.vectors[0], face.vectors[1]
     for i in range(N - 1, -1, -1):
         j = i if A.shape[0] > 1 else 0
         block = a[N_INPUT * i : N_INPUT * (i + 1)]
@@ -176,45 +161,33 @@ def _saturate(
     project(J_T, a, 0, u.size, d)
     primal_direction(J_T, d, 0, z)
     move_along(u, z, 1.0)
-    for i in range(N):
-        step_plan(transposed, c, i, u, x)
+    roll_out(model, u, face.x)
 
 
 @kernel
-def _enter_working(
-    A: Array,
-    B: Array,
-    rows: RowData,
-    guess: ByteArray,
-    state: ByteArray,
-    u: Array,
-    x: Array,
-    J_T: Array,
-    R_T: Array,
-    active: IntArray,
-    vectors: Array,
-) -> int:
+def _enter_working(model: Dynamics, rows: RowData, guess: ByteArray, face: Face) -> int:
     """The independent working rows of the guess become equalities; returns their number."""
+    u, J_T, vectors = face.u, face.J_T, face.vectors
     d, sign, cap, a, gap = vectors[0], vectors[3], vectors[5], vectors[6], vectors[7]
     nv = u.size
     q = 0
     for p in range(guess.shape[0]):
         if guess[p] != WORKING or q == nv:
             continue
-        slack = row_slack(p, u, x, rows)
+        slack = row_slack(p, u, face.x, rows)
         weight = rows.weight[(p - 4 * nv) % rows.weight.shape[0]] if p >= 4 * nv else math.inf
         if not (abs(slack) < math.inf and weight > 0.0):
             continue
-        start, stop = load_normal(p, 1.0, A, B, rows, nv, vectors)
+        start, stop = load_normal(p, 1.0, model.A, model.B, rows, nv, vectors)
         length = project(J_T, a, start, stop, d)
         zeta = 0.0
         for k in range(q, nv):
             zeta += d[k] * d[k]
         if not zeta > _DEPENDENT * length:
             continue
-        append_row(J_T, R_T, d, q)
-        active[q], sign[q], cap[q], gap[q] = p, 1.0, weight, -slack
-        state[p] = WORKING
+        append_row(J_T, face.R_T, d, q)
+        face.active[q], sign[q], cap[q], gap[q] = p, 1.0, weight, -slack
+        face.state[p] = WORKING
         q += 1
     return q
 
@@ -232,45 +205,24 @@ def _worst_multiplier(nu: Array, cap: Array, q: int) -> int:
 
 @kernel
 def start_from_guess(
-    A: Array,
-    B: Array,
-    c: Array,
-    transposed: Array,
-    rows: RowData,
-    guess: ByteArray,
-    u: Array,
-    x: Array,
-    J_T: Array,
-    R_T: Array,
-    active: IntArray,
-    state: ByteArray,
-    force: Array,
-    vectors: Array,
+    model: Dynamics, rows: RowData, guess: ByteArray, face: Face, force: Array
 ) -> tuple[int, int]:
-    """From the unconstrained optimum (u, x) to the optimum of the face that is left of the guess.
+    """From the unconstrained optimum to the optimum of the face that is left of the guess.
 
     Args:
-        A: (1 or N, 12, 12).
-        B: (1 or N, 12, 4).
-        c: (N, 12).
-        transposed: [A_i B_i]', (1 or N, 16, 12).
+        model: The dynamics.
         rows: The rows of the problem.
         guess: State of every row, (16N + 2K,).
-        u: Inputs, (N, 4), in place.
-        x: States, (N+1, 12), in place.
-        J_T: As `dual_active_set` needs it, as what follows; force, (N+1, 12), is overwritten.
-        R_T: (4N, 4N).
-        active: (4N + 1,).
-        state: Zero on entry.
-        force: (N+1, 12).
-        vectors: (N_VECTORS, 4N + 12).
+        face: The unconstrained optimum on entry, with every row inactive.
+        force: Overwritten, (N+1, 12).
 
     Returns:
         The number of working rows, and how many rows left on the way.
     """
-    z, nu, cap, sign, gap, y = vectors[1], vectors[4], vectors[5], vectors[3], vectors[7], vectors[8]
-    _saturate(A, B, c, transposed, rows, guess, state, u, x, J_T, force, vectors)
-    q = _enter_working(A, B, rows, guess, state, u, x, J_T, R_T, active, vectors)
+    u, J_T, R_T, vectors = face.u, face.J_T, face.R_T, face.vectors
+    z, nu, cap, gap, y = vectors[1], vectors[4], vectors[5], vectors[7], vectors[8]
+    _saturate(model, rows, guess, face, force)
+    q = _enter_working(model, rows, guess, face)
     changes = 0
     while True:
         solve_triangle_transposed(R_T, gap, q, y)
@@ -280,7 +232,7 @@ def start_from_guess(
             break
         changes += 1
         at_cap = nu[leaving] > 0.0
-        state[active[leaving]] = inactive_after(at_cap)
+        face.state[face.active[leaving]] = inactive_after(at_cap)
         if at_cap:  # its pull is constant from now on
             for i in range(q):
                 total = 0.0
@@ -289,14 +241,13 @@ def start_from_guess(
                 gap[i] -= cap[leaving] * total
             _add_columns(J_T, R_T[leaving], leaving + 1, z)
             move_along(u, z, cap[leaving])
-        remove_row(J_T, R_T, active, sign, nu, cap, leaving, q)
+        remove_row(face, leaving, q)
         for i in range(leaving, q - 1):
             gap[i] = gap[i + 1]
         q -= 1
     _add_columns(J_T, y, q, z)
     move_along(u, z, 1.0)
-    for i in range(u.shape[0]):
-        step_plan(transposed, c, i, u, x)
+    roll_out(model, u, face.x)
     return q, changes
 
 
@@ -313,17 +264,7 @@ def _add_columns(J_T: Array, factors: Array, count: int, z: Array) -> None:
 
 
 @kernel
-def correct(
-    rows: RowData,
-    gradient: Array,
-    u: Array,
-    x: Array,
-    J_T: Array,
-    R_T: Array,
-    active: IntArray,
-    vectors: Array,
-    q: int,
-) -> None:
+def correct(rows: RowData, gradient: Array, face: Face, q: int) -> None:
     """One step of iterative refinement on the face: inputs and multipliers against what is left of both.
 
     With g the gradient of the Lagrangian, d = J'g and gaps s of the working rows: `y = R^-T s`,
@@ -332,21 +273,17 @@ def correct(
     Args:
         rows: The rows of the problem.
         gradient: Of the Lagrangian, (4N,).
-        u: Inputs, (N, 4), in place; the states x, (N+1, 12), are those of before.
-        x: (N+1, 12).
-        J_T: As `dual_active_set` leaves it, as what follows.
-        R_T: (4N, 4N).
-        active: (4N + 1,).
-        vectors: (N_VECTORS, 4N + 12).
+        face: Its plan and multipliers are corrected; its states stay those of before.
         q: Number of working rows.
     """
+    u, J_T, R_T, vectors = face.u, face.J_T, face.R_T, face.vectors
     d, z, r, sign, nu, cap = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4], vectors[5]
     gap, y = vectors[7], vectors[8]
     project(J_T, gradient, 0, u.size, d)
     primal_direction(J_T, d, q, z)
     move_along(u, z, -1.0)
     for i in range(q):
-        gap[i] = -sign[i] * row_slack(active[i], u, x, rows)
+        gap[i] = -sign[i] * row_slack(face.active[i], u, face.x, rows)
     solve_triangle_transposed(R_T, gap, q, y)
     _add_columns(J_T, y, q, z)
     move_along(u, z, 1.0)

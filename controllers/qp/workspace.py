@@ -8,10 +8,11 @@ import numpy as np
 
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 
-from .active_set import N_VECTORS, ByteArray
+from .active_set import N_VECTORS
 from .ocp import IntArray
 from .rate_weight import rate_size
 from .recursion import RECURSION_SCRATCH
+from .rows import ByteArray
 
 
 class Workspace(NamedTuple):
