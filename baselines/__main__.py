@@ -187,7 +187,7 @@ def _run(given: list[str]) -> int:
     """Run the command of some arguments."""
     parser = make_parser()
     if given and not given[0].startswith("-") and given[0] not in COMMANDS:
-        from quad_envs.names import unknown_name
+        from quad_envs.arguments.names import unknown_name
 
         parser.error(unknown_name("command", given[0], COMMANDS))
     found, rest = parser.parse_known_args(given)
@@ -206,7 +206,7 @@ def _input_errors() -> tuple[type[Exception], ...]:
 
 def _one_line(error: Exception) -> str:
     """What is wrong, on one line and with the file or the cause where Python leaves it out."""
-    from quad_envs.names import shortened
+    from quad_envs.arguments.names import shortened
 
     text = str(error)
     if isinstance(error, OSError) and error.filename is not None:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quad_envs.checks import array_bytes, require_whole
+from quad_envs.arguments.checks import array_bytes, require_whole
 from quad_envs.compilation.decorators import kernel
 from quad_envs.observations.tracking import N_REFERENCE
 from quad_envs.parameters import N_INPUT, N_STATE, Array

@@ -9,9 +9,9 @@ import math
 
 from quad_envs.compilation.decorators import kernel
 from quad_envs.parameters import N_INPUT, N_STATE, Array
+from quad_envs.references.turning import turn_rate
 from quad_envs.rotations import sincos, wrap_angle_scalar
 from quad_envs.tasks import BaseTask
-from quad_envs.turning import turn_rate
 
 from .qp.ocp import IntArray
 

@@ -67,7 +67,7 @@ def hyperparameter_tables() -> str:
     """What each learner lets choose, in Markdown, from the comments in its options."""
     from baselines.training.algorithms import ALGORITHMS
     from baselines.training.hyperparameters import hyperparameters, plain_options
-    from quad_envs.field_comments import field_comments
+    from quad_envs.arguments.field_comments import field_comments
 
     lines = []
     for name, entry in ALGORITHMS.items():
@@ -82,7 +82,7 @@ def controller_options_table() -> str:
     from controllers.feedback.options import FeedbackLinearizationOptions, LqrOptions, SdreOptions
     from controllers.mpc.options import LmpcOptions, MpcOptions, NmpcOptions, SdcOptions
     from controllers.team.options import CentralOptions, CooperativeOptions
-    from quad_envs.field_comments import field_comments
+    from quad_envs.arguments.field_comments import field_comments
 
     lines = []
     parents = dict.fromkeys((LmpcOptions, SdcOptions, NmpcOptions), MpcOptions)
@@ -111,7 +111,7 @@ def benchmark_arguments() -> str:
 
 def _arguments(kind: type[Any]) -> str:
     """The arguments of a function whose arguments are the fields of a dataclass."""
-    from quad_envs.field_comments import field_comments
+    from quad_envs.arguments.field_comments import field_comments
 
     defaults = {field.name: field.default for field in fields(kind)}
     values = {name: defaults[name] for name in inspect.signature(kind).parameters}

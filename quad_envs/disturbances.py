@@ -14,12 +14,12 @@ from typing import Any, ClassVar, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .arguments.kinds import as_tuple, is_number, make_kind, refuse_class, require_kinds, without_booleans
+from .arguments.names import shown, unknown_name
 from .authority import hover_authority
 from .compilation.decorators import inline_kernel, kernel
-from .kinds import as_tuple, is_number, make_kind, refuse_class, require_kinds, without_booleans
+from .compilation.normals import draw, drawn_size, key_of
 from .limits import Limits
-from .names import shown, unknown_name
-from .normals import draw, drawn_size, key_of
 from .parameters import Array, QuadrotorParams
 
 _Vector = tuple[float, float, float]

@@ -12,9 +12,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .checks import Bound, require_number, require_whole
-from .kinds import holds_booleans
-from .names import shown, unknown_name
+from .arguments.checks import Bound, require_number, require_whole
+from .arguments.kinds import holds_booleans
+from .arguments.names import shown, unknown_name
 from .parameters import Array
 
 FORMATIONS = ("triangle", "hexagon", "lattice")

@@ -19,10 +19,10 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .checks import Bound, array_bytes, require_memory, require_number, require_whole
+from .arguments.checks import Bound, array_bytes, require_memory, require_number, require_whole
+from .arguments.kinds import is_number, make_kind, refuse_class, require_kinds
+from .arguments.names import shown, unknown_name
 from .formations import FORMATIONS, lattice_cells
-from .kinds import is_number, make_kind, refuse_class, require_kinds
-from .names import shown, unknown_name
 from .parameters import Array
 
 # (sender, receiver), rows counted from 0, or (sender, receiver, weight)

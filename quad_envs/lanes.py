@@ -13,8 +13,8 @@ from .compilation.decorators import Int, inline_kernel, inline_lane_kernel
 from .limits import LIMITS
 from .parameters import N_COEFFICIENTS
 from .plant import N_INPUT, N_STATE, Array
+from .references.table_row import N_TABLE
 from .reward import LOSS_PARTS
-from .table_row import N_TABLE
 
 LANES = 4  # one vector register of doubles
 

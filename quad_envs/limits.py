@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .kinds import is_limit, is_number, require_kinds
-from .names import shown
+from .arguments.kinds import is_limit, is_number, require_kinds
+from .arguments.names import shown
 from .plant import N_INPUT, N_STATE, POSITION, RATES, VELOCITY, Array
 
 MOST_KAPPA = 20.0  # thrust-to-weight 80, beyond any vehicle; the dissertation has 1

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .checks import Bound, require_number
-from .kinds import is_number, require_kinds
+from .arguments.checks import Bound, require_number
+from .arguments.kinds import is_number, require_kinds
+from .arguments.names import shown
 from .limits import Limits as Limits
-from .names import shown
 from .plant import ATTITUDE as ATTITUDE
 from .plant import FORCES as FORCES
 from .plant import N_INPUT as N_INPUT

@@ -8,8 +8,8 @@ import gymnasium
 import pettingzoo
 from gymnasium.envs.registration import EnvSpec
 
+from .arguments.names import shown
 from .episode_limit import SuiteSpec
-from .names import shown
 
 ENTRY = "quad_envs.envs.tracking.env:TrackingEnv"
 VECTOR_ENTRY = "quad_envs.envs.tracking.vector:TrackingVectorEnv"

@@ -5,7 +5,7 @@
 It is positive while the vehicle flies within its limits and a crash ends the episode, so that crashing early
 is never better than flying badly. x_ref = [p_ref; R_BI v_ref; 0, 0, psi_ref; E(Theta) [0, 0, psi_dot]]: the
 velocity error is the inertial one, seen in body axes; the yaw error is wrapped; the wanted body rates are
-those of a heading that turns (`quad_envs.turning`).
+those of a heading that turns (`quad_envs.references.turning`).
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike
 
 from .compilation.decorators import inline_kernel
 from .parameters import Array, Weights
+from .references.table_row import HEADING, TURN_RATE
+from .references.turning import turning_rates
 from .rotations import rotation_body_from_inertial, sincos, wrap_angle, wrap_angle_scalar
-from .table_row import HEADING, TURN_RATE
-from .turning import turning_rates
 
 # Of the stage cost; the last one is that of teams.
 LOSS_PARTS = ("position", "velocity", "attitude", "rates", "effort", "formation")

@@ -29,8 +29,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .arguments.names import unknown_name
 from .compilation.decorators import Int, inline_kernel
-from .names import unknown_name
 from .parameters import Array
 
 N_MEASUREMENT = 3  # range, m; azimuth, rad; elevation, rad

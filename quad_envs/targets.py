@@ -15,8 +15,8 @@ from typing import Any, ClassVar, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .kinds import make_kind, refuse_class, without_booleans
-from .names import shown, unknown_name
+from .arguments.kinds import make_kind, refuse_class, without_booleans
+from .arguments.names import shown, unknown_name
 from .parameters import Array
 from .references import (
     REFERENCES,

@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-from .names import unknown_name
+from .arguments.names import unknown_name
 from .parameters import QuadrotorParams
 
 

@@ -6,14 +6,14 @@ import pytest
 from control_period import control_period
 
 from baselines.training.flights import DifferentiableFlights
-from quad_envs.adjoint import SCRATCH_ROWS, step_vjp
 from quad_envs.dynamics import simulate
+from quad_envs.envs.shared.adjoint import SCRATCH_ROWS, step_vjp
 from quad_envs.envs.shared.task_vector import task_vector
 from quad_envs.envs.tracking.adjoint import action_slopes, reward_vjp, tracking_vjp_rows
 from quad_envs.lanes import COMMAND
 from quad_envs.parameters import QuadrotorParams
 from quad_envs.references import Heading, make_reference
-from quad_envs.turning import with_turn_rates
+from quad_envs.references.turning import with_turn_rates
 
 STEP = 1e-6  # of the differences: their error is about 1e-9 for functions of order one
 LIMITS = {

@@ -7,9 +7,9 @@ import pytest
 from baselines import evaluate, make_policy
 from controllers import ExactNmpc, FeedbackLinearization, LinearMPC, Lqr, SdcNmpc, Sdre
 from controllers.team.central import CentralMpc
-from quad_envs.adjoint import step_vjp
 from quad_envs.compilation.decorators import kernel
 from quad_envs.dynamics import derivative_reference, rigid_body, rotor_shares, simulate
+from quad_envs.envs.shared.adjoint import step_vjp
 from quad_envs.lanes import FORCE_MAX
 from quad_envs.parameters import RATES, Limits, QuadrotorParams
 from quad_envs.tasks import Task, TeamTask

@@ -13,7 +13,7 @@ from baselines.training.held_out import training_options
 from baselines.training.imitation import LabelledFlights, make_expert
 from baselines.training.team_flights import DifferentiableTeams
 from quad_envs import cooperative_estimation_v0, formation_v0, target_tracking_v0
-from quad_envs.encoding import hover_actions
+from quad_envs.wrappers.encoding import hover_actions
 
 TARGET = "quad/TargetTracking-v0"
 LOSSY = {"delay": 1, "drop_out": 0.3, "detection": 0.7, "graph": "complete", "terminate": "agent"}
@@ -127,7 +127,7 @@ def test_labels_are_what_the_expert_does_with_the_estimate_that_the_network_sees
 def test_rows_in_training_see_the_estimates_of_their_filters():
     pytest.importorskip("stable_baselines3")
     from baselines.training.vec_env import TrainingVecEnv
-    from quad_envs.encoding import Encoding
+    from quad_envs.wrappers.encoding import Encoding
 
     options = training_options(TARGET, {"max_cycles": 12, "delay": 1})
     encoding = Encoding(training_features(options))

@@ -14,16 +14,17 @@ from baselines.sweeps.choices import EnvChoice, PolicyChoice
 from baselines.sweeps.suite import Suite
 from baselines.training.plans import make_plan
 from baselines.training.request import TrainingRequest
-from quad_envs import checks, cooperative_estimation_v0, formation_v0, target_tracking_v0
-from quad_envs.checks import Bound, require_memory, require_number, require_whole
+from quad_envs import cooperative_estimation_v0, formation_v0, target_tracking_v0
+from quad_envs.arguments import checks
+from quad_envs.arguments.checks import Bound, require_memory, require_number, require_whole
+from quad_envs.arguments.kinds import is_number
+from quad_envs.arguments.names import shown
 from quad_envs.disturbances import Gusts, Steady
 from quad_envs.envs.shared.random_vehicles import drawn_vehicles
 from quad_envs.envs.shared.vehicle_options import RANDOMIZABLE
 from quad_envs.envs.team.options import EstimationOptions, FormationOptions
 from quad_envs.envs.tracking.options import TrackingOptions
 from quad_envs.formations import tried_starts
-from quad_envs.kinds import is_number
-from quad_envs.names import shown
 from quad_envs.parameters import QuadrotorParams, require_inertia
 from quad_envs.references import Heading, Helix, from_function
 from quad_envs.targets import ConstantVelocity, StaticTarget

@@ -17,8 +17,8 @@ from baselines.policies.checkpoints import load_checkpoint, save_checkpoint
 from baselines.policies.environments import make_env, task_of
 from baselines.policies.network import Network, NetworkPolicy
 from baselines.policies.trained import SHIPPED
-from quad_envs.encoding import hover_actions, hover_outputs, hover_slopes
 from quad_envs.observations.features import Features, default_features
+from quad_envs.wrappers.encoding import hover_actions, hover_outputs, hover_slopes
 
 HELIX, FORMATION = "quad/HelixTracking-v0", "quad/Formation-v0"
 ABOUT = {"env_id": HELIX, "mission": "tracking", "algorithm": "apg", "kind": "model-based", "score": 0.5}

@@ -10,7 +10,7 @@ import sys
 import pytest
 from commands import fails
 
-from quad_envs.names import shortened
+from quad_envs.arguments.names import shortened
 
 HELIX = "quad/HelixTracking-v0"
 RUN = f"{shlex.quote(sys.executable)} -m baselines"

@@ -25,7 +25,7 @@ from baselines.training.request import TrainingRequest
 from controllers import CooperativeOptions, LmpcOptions, NmpcOptions, SdcOptions
 from controllers.feedback.options import FeedbackLinearizationOptions, LqrOptions, SdreOptions
 from controllers.team.options import CentralOptions
-from quad_envs.field_comments import field_comments
+from quad_envs.arguments.field_comments import field_comments
 from quad_envs.registration import TEAMS, TRACKING
 
 README = ROOT / "README.md"

@@ -13,9 +13,9 @@ from baselines.policies.disturbance_estimate import with_estimate
 from baselines.policies.environments import task_of
 from baselines.policies.network import Network
 from baselines.policies.network_policies import network_policy
-from quad_envs.encoding import Encoder, Encoding
 from quad_envs.observations.features import default_features
 from quad_envs.observations.heading import HeadingAxes
+from quad_envs.wrappers.encoding import Encoder, Encoding
 
 RANDOM = "quad/RandomTracking-v0"
 ANGLE = 2.2  # rad

@@ -15,8 +15,8 @@ from baselines.training.algorithm_options import PpoOptions, SacOptions
 from baselines.training.algorithms import ALGORITHMS, options_of
 from baselines.training.former_names import _TODAY, name_of_today
 from baselines.training.hyperparameters import hyperparameters, recorded_hyperparameters
+from quad_envs.arguments.field_comments import field_comments
 from quad_envs.envs.tracking.options import TrackingOptions
-from quad_envs.field_comments import field_comments
 
 HELIX = "quad/HelixTracking-v0"
 LEARNERS = ["apg", "dagger", "ppo", "ppo-lagrangian", "sac"]

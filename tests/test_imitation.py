@@ -13,8 +13,8 @@ from baselines.training.imitation import DaggerOptions, LabelledFlights, Labels,
 from baselines.training.imitation import train as dagger
 from baselines.training.policy_gradient import PolicyGradientOptions
 from baselines.training.policy_gradient import train as policy_gradient
-from quad_envs.encoding import hover_actions
 from quad_envs.observations.features import default_features
+from quad_envs.wrappers.encoding import hover_actions
 
 HELIX, RANDOM, FORMATION = "quad/HelixTracking-v0", "quad/RandomTracking-v0", "quad/Formation-v0"
 TARGET, CORRIDOR = "quad/TargetTracking-v0", "quad/CorridorTracking-v0"

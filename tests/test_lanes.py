@@ -15,6 +15,7 @@ from gymnasium.utils import seeding
 from quad_envs import Gusts, Steady
 from quad_envs.compilation.decorators import kernel
 from quad_envs.compilation.intrinsics import _take_nearest, take_nearest
+from quad_envs.compilation.normals import draw
 from quad_envs.constraints import (
     TOLERANCE,
     constraint_scales,
@@ -32,12 +33,11 @@ from quad_envs.envs.shared.task_vector import task_vector
 from quad_envs.envs.shared.vehicle_options import CRASH_TILT
 from quad_envs.envs.tracking.kernel import command, judge
 from quad_envs.lanes import COEFFICIENTS, DECAY, FORCE_MAX, LANES, N_FLIGHT, N_TRACKING, Blocks
-from quad_envs.normals import draw
 from quad_envs.parameters import N_COEFFICIENTS, ROTOR_RATE
 from quad_envs.references import Heading, Racetrack, RandomSmooth
+from quad_envs.references.table_row import N_TABLE
+from quad_envs.references.turning import tabulate, with_turn_rates
 from quad_envs.reward import stage_cost
-from quad_envs.table_row import N_TABLE
-from quad_envs.turning import tabulate, with_turn_rates
 
 HELIX = "quad/HelixTracking-v0"
 LIMITS = {

@@ -17,8 +17,8 @@ from baselines.policies.network_kernels import BLOCK
 from baselines.policies.trained import SHIPPED
 from quad_envs.compilation import tiles
 from quad_envs.compilation.decorators import kernel
-from quad_envs.encoding import hover_actions
 from quad_envs.observations.features import default_features
+from quad_envs.wrappers.encoding import hover_actions
 
 HELIX = "quad/HelixTracking-v0"
 COUNTS = (1, 2, 7, 64, 1000)

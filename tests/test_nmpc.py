@@ -10,9 +10,9 @@ from controllers import ExactNmpc
 from controllers.mpc.residual import gauss_newton_weight, rates_residual, velocity_residual
 from controllers.qp.riccati import dare
 from quad_envs.parameters import Limits
+from quad_envs.references.turning import TURN_RATE, turning_rates, with_turn_rates
 from quad_envs.rotations import rotation_body_from_inertial
 from quad_envs.tasks import Task
-from quad_envs.turning import TURN_RATE, turning_rates, with_turn_rates
 
 N = 25
 STATE = np.r_[0.5, -0.4, 0.3, 1, 0.5, -0.5, 0.2, -0.3, 0.1, 0.5, 0.4, 0.1, np.full(4, HOVER)]

@@ -6,7 +6,7 @@ from drawn import normal_numbers
 from scipy import stats
 
 from quad_envs.compilation.decorators import kernel
-from quad_envs.normals import draw, drawn_size, key_of, log, philox, sincos_of_double
+from quad_envs.compilation.normals import draw, drawn_size, key_of, log, philox, sincos_of_double
 
 
 @kernel

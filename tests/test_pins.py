@@ -10,7 +10,7 @@ from packaging.utils import canonicalize_name
 from sources import ROOT, reads_sources
 
 from baselines.cli.doctor import EXTRAS
-from quad_envs.extras import install_command
+from quad_envs.arguments.extras import install_command
 
 if sys.version_info >= (3, 11):
     import tomllib

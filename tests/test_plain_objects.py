@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from quad_envs import formation_v0, target_tracking_v0
+from quad_envs.arguments.kinds import make_kind, mapping_of
 from quad_envs.disturbances import DISTURBANCES, Steady, TorquePulse, make_disturbance
 from quad_envs.graphs import KINDS, Switching, Timed, make_graph, make_graph_table
-from quad_envs.kinds import make_kind, mapping_of
 from quad_envs.references import REFERENCES, ArrayTable, Heading, Helix, Line, SetPoint, make_reference
 from quad_envs.targets import TARGETS, PathTarget, StaticTarget, TurningTarget, make_target
 

@@ -12,7 +12,7 @@ from baselines.training.features import training_features  # noqa: E402
 from baselines.training.flights import DifferentiableFlights  # noqa: E402
 from baselines.training.held_out import training_options  # noqa: E402
 from baselines.training.policy_gradient import Actor, _window_gradient, train  # noqa: E402
-from quad_envs.encoding import hover_actions  # noqa: E402
+from quad_envs.wrappers.encoding import hover_actions  # noqa: E402
 
 RANDOM = "quad/RandomTracking-v0"
 OPTIONS, EPSILON = PolicyGradientOptions(net_arch=(16,)), 1e-3

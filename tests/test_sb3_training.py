@@ -42,13 +42,13 @@ from baselines.training.sb3 import (
     train_sac,
 )
 from baselines.training.vec_env import TrainingVecEnv
-from quad_envs.encoding import hover_actions
 from quad_envs.envs.team.options import EstimationOptions, FormationOptions, TargetTrackingOptions
 from quad_envs.envs.team.vector import TeamVectorEnv
 from quad_envs.envs.tracking.options import TrackingOptions
 from quad_envs.envs.tracking.vector import TrackingVectorEnv
 from quad_envs.registration import TRACKING
 from quad_envs.wrappers import FilterAndRescale
+from quad_envs.wrappers.encoding import hover_actions
 
 HELIX, SPIRAL = "quad/HelixTracking-v0", "quad/SpiralTracking-v0"
 SHORT = {"reference": "random", "time_limit": 1.0, "preview": 3}

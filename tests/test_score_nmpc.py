@@ -14,9 +14,9 @@ from controllers.mpc.score import score_loss, tangent_weight
 from controllers.qp.osqp import OsqpSolver
 from quad_envs.dynamics import derivative_reference
 from quad_envs.parameters import Limits
+from quad_envs.references.turning import with_turn_rates
 from quad_envs.reward import stage_cost
 from quad_envs.tasks import Task
-from quad_envs.turning import with_turn_rates
 
 N = 25
 MORE = N + 1  # horizon of a window from which the next sample has its own, too

@@ -19,8 +19,8 @@ from baselines.training.imitation import LabelledFlights, make_expert
 from baselines.training.team_flights import DifferentiableTeams
 from controllers.disturbance import ESTIMATOR_SIZE
 from quad_envs import formation_v0, target_tracking_v0
-from quad_envs.encoding import hover_actions
 from quad_envs.observations.features import default_features
+from quad_envs.wrappers.encoding import hover_actions
 
 FORMATION, TARGET = "quad/Formation-v0", "quad/TargetTracking-v0"
 BLOWN = {"vehicles": 3, "formation": "triangle", "disturbance": "gusts"}

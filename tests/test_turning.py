@@ -9,9 +9,9 @@ from baselines import make_policy, run_episodes
 from quad_envs import Heading, Helix, SetPoint, formation_v0, from_function
 from quad_envs.constraints import forces_from_actions
 from quad_envs.references.trajectories import pack_rows
+from quad_envs.references.turning import LARGEST_TURN, TURN_RATE, turn_rate, turning_rates, with_turn_rates
 from quad_envs.reward import stage_cost
 from quad_envs.rotations import euler_rate_matrix
-from quad_envs.turning import LARGEST_TURN, TURN_RATE, turn_rate, turning_rates, with_turn_rates
 
 DT = 0.05
 CIRCLE = Heading(Helix(2.0, 0.8, 0.0), tangent=True)

@@ -17,7 +17,7 @@ from controllers.stability.invariant import (
     largest_ellipsoid,
     law_halfspaces,
 )
-from quad_envs.checks import require_whole
+from quad_envs.arguments.checks import require_whole
 from quad_envs.parameters import Array
 
 from ..files import plain_json

@@ -14,7 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from quad_envs.names import shortened, unknown_name
+from quad_envs.arguments.names import shortened, unknown_name
 
 from ..interruptions import exit_code, raise_lost
 from .options import BenchmarkOptions, EvaluateOptions, ListOptions, read_assignments
@@ -132,7 +132,7 @@ def _shelves() -> list[_Shelf]:
 def _list_options(options: ListOptions) -> int:
     from dataclasses import fields
 
-    from quad_envs.field_comments import field_comments
+    from quad_envs.arguments.field_comments import field_comments
     from quad_envs.registration import TEAMS, TRACKING
 
     from ..policies.outside import installed_policies

@@ -260,7 +260,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Exit with code 2."""
-        from quad_envs.names import shortened  # here, so that --help need not load Gymnasium
+        from quad_envs.arguments.names import shortened  # here, so that --help need not load Gymnasium
 
         self.exit(2, f"{self.prog}: error: {shortened(message)} (--help shows what there is)\n")
 
@@ -308,7 +308,7 @@ def refuse_unknown(rest: Sequence[str], kind: type[Any], parser: Parser) -> None
     """One clear line about arguments that no option takes."""
     if not rest:
         return
-    from quad_envs.names import shown, unknown_name
+    from quad_envs.arguments.names import shown, unknown_name
 
     hints = get_type_hints(kind, include_extras=True)
     known = [_flag(name) for name, hint in hints.items() if not isinstance(get_args(hint)[1], Positional)]
@@ -324,7 +324,7 @@ def read_assignments(flag: str, texts: Sequence[str]) -> dict[str, Any]:
     Raises:
         ValueError: If one has no '=', a key comes twice, or a value begins with a bracket and is no mapping.
     """
-    from quad_envs.names import shown
+    from quad_envs.arguments.names import shown
 
     out: dict[str, Any] = {}
     for text in texts:

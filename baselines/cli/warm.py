@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from quad_envs.checks import require_whole
+from quad_envs.arguments.checks import require_whole
 from quad_envs.compilation.portable import settings
 
 from .options import WarmOptions

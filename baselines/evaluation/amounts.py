@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from quad_envs.checks import require_memory, require_whole
+from quad_envs.arguments.checks import require_memory, require_whole
 
 MOST_EPISODES = 100_000
 INTERVAL_LEAST = 5  # flights, below which no interval is said

@@ -13,8 +13,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
-from quad_envs.checks import require_whole
-from quad_envs.names import shown
+from quad_envs.arguments.checks import require_whole
+from quad_envs.arguments.names import shown
 from quad_envs.observations.tracking import N_REFERENCE
 from quad_envs.parameters import Array
 from quad_envs.tasks import BaseTask, TeamTask

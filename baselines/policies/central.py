@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from controllers.controller import Decision
 from controllers.team.central import CentralMpc
 from controllers.team.options import CentralOptions
+from quad_envs.arguments.names import shown
 from quad_envs.constraints import actions_from_forces
-from quad_envs.names import shown
 from quad_envs.observations.tracking import N_REFERENCE
 from quad_envs.parameters import N_INPUT, Array
 from quad_envs.tasks import TeamTask

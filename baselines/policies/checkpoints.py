@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from quad_envs.names import shown
+from quad_envs.arguments.names import shown
 from quad_envs.observations.features import Features
 
 from ..errors import CheckpointError, ResultsError

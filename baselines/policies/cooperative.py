@@ -11,7 +11,7 @@ from controllers.mpc.options import chosen, shared
 from controllers.team.cooperative import CooperativeDecision, CooperativeMpc
 from controllers.team.options import CooperativeOptions, FormationMpcOptions
 from controllers.team.situation import TargetEstimate, TeamSituation
-from quad_envs.names import unknown_name
+from quad_envs.arguments.names import unknown_name
 from quad_envs.observations.team import N_SENSED
 from quad_envs.observations.tracking import N_REFERENCE
 from quad_envs.parameters import Array

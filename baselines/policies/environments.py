@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 
 import quad_envs  # noqa: F401  registers the ids
-from quad_envs.names import shown, unknown_name
+from quad_envs.arguments.names import shown, unknown_name
 from quad_envs.registration import TEAMS, TRACKING
 from quad_envs.tasks import BaseTask
 

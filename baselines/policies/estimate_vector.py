@@ -12,9 +12,9 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from controllers.estimation.consistency import nees
+from quad_envs.arguments.names import shown
 from quad_envs.envs.shared.vector_parts import presence
 from quad_envs.envs.team.vector import TeamVectorEnv
-from quad_envs.names import shown
 from quad_envs.parameters import Array
 from quad_envs.tasks import TeamTask
 

@@ -18,8 +18,8 @@ from controllers.estimation import PolarEstimator, RandomWalkEstimator
 from controllers.estimation.ekf import Restart
 from controllers.estimation.trilateration import acceptance_limits
 from controllers.estimation.trilateration_kernels import MAX_RATIO
+from quad_envs.arguments.names import shown, unknown_name
 from quad_envs.envs.team.kernel import ESTIMATE_REACH, ESTIMATE_SPEED
-from quad_envs.names import shown, unknown_name
 from quad_envs.observations.team import N_ESTIMATE
 from quad_envs.parameters import Array
 from quad_envs.sensors import RANGE, reads, sensor_rows

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quad_envs.names import shown
+from quad_envs.arguments.names import shown
 from quad_envs.observations.features import Features
 from quad_envs.parameters import Array
 from quad_envs.tasks import BaseTask, Task, TeamTask

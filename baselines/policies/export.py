@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quad_envs.checks import require_path
-from quad_envs.encoding import Encoder
+from quad_envs.arguments.checks import require_path
 from quad_envs.observations.features import Features, entry_names
 from quad_envs.tasks import TeamTask
+from quad_envs.wrappers.encoding import Encoder
 
 from ..errors import CheckpointError
 from .checkpoints import DESCRIPTION, save_checkpoint

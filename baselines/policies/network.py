@@ -13,14 +13,14 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_envs.arguments.names import shown
 from quad_envs.compilation.decorators import entry_of
 from quad_envs.compilation.tiles import STRIP, packed
-from quad_envs.encoding import Encoding, hover_gains
-from quad_envs.names import shown
 from quad_envs.observations.features import Features
 from quad_envs.observations.heading import HeadingAxes
 from quad_envs.parameters import Array
 from quad_envs.tasks import BaseTask, Task, TeamTask
+from quad_envs.wrappers.encoding import Encoding, hover_gains
 
 from .network_kernels import BLOCK, forward_rows
 from .protocol import Actions, PolicyState
@@ -50,7 +50,7 @@ class Network:
     squash: Squash = "tanh"  # how outputs come into [-1, 1]
     commands: Commands = "hover"  # outputs are forces about hover, or "action": they are the actions
     activation: Activation = "tanh"  # of all layers but the last
-    command_range: float = 1.0  # of outputs about hover, see `quad_envs.encoding.Encoding`
+    command_range: float = 1.0  # of outputs about hover, see `quad_envs.wrappers.encoding.Encoding`
 
     def __post_init__(self) -> None:
         for name, kind in (("squash", Squash), ("commands", Commands), ("activation", Activation)):

@@ -14,7 +14,7 @@ from functools import cache
 from importlib import import_module, metadata
 from typing import Any
 
-from quad_envs.names import suggestion, unknown_name
+from quad_envs.arguments.names import suggestion, unknown_name
 
 from ..errors import PolicyError
 from .blame import place_of, place_where_defined, told

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from controllers.estimation import Estimator, Measurements, Prior, ekf
-from quad_envs.names import shown
+from quad_envs.arguments.names import shown
 from quad_envs.observations.team import N_MEASURED
 from quad_envs.parameters import Array
 from quad_envs.sensors import N_MEASUREMENT, sensor_rows

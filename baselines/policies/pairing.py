@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import gymnasium
 
-from quad_envs.names import shown
+from quad_envs.arguments.names import shown
 from quad_envs.tasks import BaseTask
 from quad_envs.wrappers.vector import FilterAndRescale
 

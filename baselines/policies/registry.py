@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
-from quad_envs.field_comments import field_comments
-from quad_envs.kinds import holds_booleans, is_limit
-from quad_envs.names import shown, unknown_name
+from quad_envs.arguments.field_comments import field_comments
+from quad_envs.arguments.kinds import holds_booleans, is_limit
+from quad_envs.arguments.names import shown, unknown_name
 
 from .outside import build, installed_policies, is_outside, names_factory, outside_options
 from .protocol import Policy

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from controllers.mpc.options import SafetyOptions
 from controllers.mpc.safety import Correction, SafetyFilter
+from quad_envs.arguments.names import shown
 from quad_envs.constraints import forces_from_actions
-from quad_envs.names import shown
 from quad_envs.parameters import N_INPUT, Array
 from quad_envs.tasks import BaseTask, Task
 

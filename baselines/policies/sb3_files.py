@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_envs.encoding import Encoder
-from quad_envs.names import shown
+from quad_envs.arguments.names import shown
 from quad_envs.wrappers.encoded_space import EncodedBox, encoder_of
+from quad_envs.wrappers.encoding import Encoder
 
 from ..errors import CheckpointError, MissingPackageError
 from .network import Activation, Squash

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_envs.encoding import Encoder
+from quad_envs.wrappers.encoding import Encoder
 
 from ..errors import CheckpointError, MissingPackageError, PolicyError
 from .disturbance_estimate import sees_estimate

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from controllers.estimation import covariance_intersection
 from controllers.estimation.ekf import constant_velocity_model
-from quad_envs.names import unknown_name
+from quad_envs.arguments.names import unknown_name
 from quad_envs.observations.team import COMM_AGE, COMM_POSITION, COMM_WEIGHT, N_ESTIMATE
 from quad_envs.parameters import Array
 from quad_envs.tasks import TeamTask

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_envs.checks import require_whole
+from quad_envs.arguments.checks import require_whole
 from quad_envs.tasks import TeamTask
 
 from .protocol import N_FALLBACKS, Actions, PolicyState

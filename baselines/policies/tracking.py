@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controllers.controller import TURNING_ROWS, Controller, Decision
-from quad_envs.checks import require_whole
+from quad_envs.arguments.checks import require_whole
 from quad_envs.compilation.decorators import kernel
 from quad_envs.constraints import action_from_force, forces_from_actions
 from quad_envs.observations.tracking import N_OWN, N_REFERENCE, decode_own

@@ -10,8 +10,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quad_envs.checks import require_path
-from quad_envs.names import shown, unknown_name
+from quad_envs.arguments.checks import require_path
+from quad_envs.arguments.names import shown, unknown_name
 
 from ..errors import CheckpointError
 

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from quad_envs.names import shown
+from quad_envs.arguments.names import shown
 
 from ..errors import CheckpointError
 from ..files import plain_json, write_atomic

@@ -11,9 +11,9 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from quad_envs.checks import require_paths
-from quad_envs.field_comments import called_with
-from quad_envs.names import shown
+from quad_envs.arguments.checks import require_paths
+from quad_envs.arguments.field_comments import called_with
+from quad_envs.arguments.names import shown
 
 from ..errors import ResultsError
 from ..evaluation.amounts import require_jobs

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from baselines.errors import ResultsError
 from baselines.evaluation.evaluate import NO_SPANNING_TREE
-from quad_envs.names import unknown_name
+from quad_envs.arguments.names import unknown_name
 
 from ..sweeps.choices import TableChoice
 from ..sweeps.folder import Finished, Flown, Run, read_contenders

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from quad_envs.checks import require_path
-from quad_envs.names import shown
+from quad_envs.arguments.checks import require_path
+from quad_envs.arguments.names import shown
 from quad_envs.tasks import BaseTask, TeamTask
 
 from ..evaluation.episode import Episode

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
-from quad_envs.names import unknown_name
+from quad_envs.arguments.names import unknown_name
 
 from ..evaluation.amounts import require_jobs
 from ..files import locked

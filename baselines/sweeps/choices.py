@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from quad_envs.checks import require_whole
-from quad_envs.names import shown
+from quad_envs.arguments.checks import require_whole
+from quad_envs.arguments.names import shown
 from quad_envs.registration import TEAMS
 
 TEAMS_PART, TRACKING_PART = "teams", "tracking"

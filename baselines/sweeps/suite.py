@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from quad_envs.checks import require_whole
-from quad_envs.names import shown, unknown_name
+from quad_envs.arguments.checks import require_whole
+from quad_envs.arguments.names import shown, unknown_name
 
 from ..evaluation.amounts import require_episodes
 from ..files import plain_json

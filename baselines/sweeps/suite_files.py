@@ -44,8 +44,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
 
-from quad_envs.checks import require_path
-from quad_envs.names import shown, unknown_name
+from quad_envs.arguments.checks import require_path
+from quad_envs.arguments.names import shown, unknown_name
 from quad_envs.registration import TEAMS, TRACKING
 
 from ..policies.registry import TEAM_POLICIES, TRACKING_POLICIES, behind_filter, from_outside

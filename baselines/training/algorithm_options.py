@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
-from quad_envs.checks import require_memory, require_whole
-from quad_envs.names import shown
+from quad_envs.arguments.checks import require_memory, require_whole
+from quad_envs.arguments.names import shown
 
 if TYPE_CHECKING:
     from ..policies.network import Squash

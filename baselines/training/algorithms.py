@@ -17,8 +17,8 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, NamedTuple
 
-from quad_envs.extras import install_command
-from quad_envs.names import unknown_name
+from quad_envs.arguments.extras import install_command
+from quad_envs.arguments.names import unknown_name
 
 from ..errors import MissingPackageError
 from .algorithm_options import (

@@ -11,8 +11,8 @@ from typing import Any
 
 from numba.core import event
 
-from quad_envs.kinds import is_number
-from quad_envs.names import shown
+from quad_envs.arguments.kinds import is_number
+from quad_envs.arguments.names import shown
 
 _COMPILING = "numba:compile"
 

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from quad_envs.arguments.names import shown
 from quad_envs.envs.team.options import TeamOptions
 from quad_envs.envs.tracking.options import TrackingOptions
 from quad_envs.graphs import in_neighbours
-from quad_envs.names import shown
 from quad_envs.observations.features import Features, default_features
 from quad_envs.observations.team import AgentLayout
 from quad_envs.tasks import Task, TeamTask

@@ -12,19 +12,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_envs.adjoint import SCRATCH_ROWS
-from quad_envs.encoding import Encoding
+from quad_envs.arguments.names import shown
+from quad_envs.envs.shared.adjoint import SCRATCH_ROWS
 from quad_envs.envs.shared.task_vector import task_vector
 from quad_envs.envs.tracking.adjoint import action_slopes, tracking_vjp_rows
 from quad_envs.envs.tracking.batch import TrackingBatch
 from quad_envs.envs.tracking.options import TrackingOptions
 from quad_envs.envs.tracking.scores import scores_of
 from quad_envs.lanes import COEFFICIENTS, COMMAND, FORCE_MAX, N_PLANT, PLANT, STEP
-from quad_envs.names import shown
 from quad_envs.observations.features import Features, preview_stages
 from quad_envs.observations.tracking import N_OWN, N_REFERENCE
 from quad_envs.parameters import N_COEFFICIENTS
 from quad_envs.plant import N_INPUT, Array
+from quad_envs.wrappers.encoding import Encoding
 
 from .features import training_features
 from .observer import Observer

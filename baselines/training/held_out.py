@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 
-from quad_envs.names import unknown_name
+from quad_envs.arguments.names import unknown_name
 from quad_envs.registration import ENTRY, TEAMS, TRACKING, VECTOR_ENTRY
 
 from ..evaluation.columns import renamed

@@ -12,8 +12,8 @@ from dataclasses import MISSING, asdict, fields
 from importlib import resources
 from typing import Any
 
-from quad_envs.kinds import is_number
-from quad_envs.names import shown, unknown_name
+from quad_envs.arguments.kinds import is_number
+from quad_envs.arguments.names import shown, unknown_name
 
 from .algorithms import ALGORITHMS, options_of
 from .former_names import in_names_of_today, may_be_slip, name_of_today

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quad_envs.encoding import Encoding, hover_outputs
+from quad_envs.arguments.names import shown
 from quad_envs.envs.team.options import TeamOptions
 from quad_envs.envs.team.vector import TeamVectorEnv
 from quad_envs.envs.tracking.options import TrackingOptions
 from quad_envs.envs.tracking.vector import TrackingVectorEnv
-from quad_envs.names import shown
 from quad_envs.tasks import BaseTask, TeamTask
+from quad_envs.wrappers.encoding import Encoding, hover_outputs
 
 from ..errors import TrainingError
 from ..evaluation.rollout import is_privileged

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_envs.encoding import Encoder, Encoding
 from quad_envs.tasks import Task, TeamTask
+from quad_envs.wrappers.encoding import Encoder, Encoding
 
 from ..policies.disturbance_estimate import Bools, Floats
 from ..policies.estimators import Estimators, asks_for_estimates

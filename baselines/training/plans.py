@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from quad_envs.names import shown
+from quad_envs.arguments.names import shown
 
 from ..errors import ResultsError
 from ..policies.checkpoints import load_checkpoint

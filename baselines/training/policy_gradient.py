@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from quad_envs.encoding import hover_actions, hover_slopes
 from quad_envs.envs.team.options import TeamOptions
 from quad_envs.envs.tracking.options import TrackingOptions
 from quad_envs.observations.features import Features
+from quad_envs.wrappers.encoding import hover_actions, hover_slopes
 
 from ..errors import TrainingError
 from ..policies.network import Floats, Network, Squash

@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import quad_envs
-from quad_envs.checks import Bound, require_number
-from quad_envs.extras import install_command
-from quad_envs.names import shown
+from quad_envs.arguments.checks import Bound, require_number
+from quad_envs.arguments.extras import install_command
+from quad_envs.arguments.names import shown
 
 from ..errors import MissingPackageError
 from ..evaluation.rollout import check_flights, run_episodes

@@ -9,7 +9,7 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
 
-from quad_envs.checks import require_mappings, require_paths, require_words
+from quad_envs.arguments.checks import require_mappings, require_paths, require_words
 
 from .watching import Watcher
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from quad_envs.field_comments import called_with
+from quad_envs.arguments.field_comments import called_with
 
 from ..errors import CheckpointError, ResultsError, TrainingError
 from ..files import locked

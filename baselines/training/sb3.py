@@ -19,10 +19,10 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv
 
-from quad_envs.encoding import Encoding
 from quad_envs.envs.team.options import TeamOptions
 from quad_envs.envs.tracking.options import TrackingOptions
 from quad_envs.wrappers.encoded_space import stages_of
+from quad_envs.wrappers.encoding import Encoding
 
 from ..errors import TrainingError
 from ..policies.network import Network

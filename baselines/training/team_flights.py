@@ -15,18 +15,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_envs.encoding import Encoding
+from quad_envs.arguments.names import shown
 from quad_envs.envs.team.adjoint import TeamRecord, advance_teams_vjp, observe_teams_vjp, team_scratch
 from quad_envs.envs.team.batch import TeamBatch
 from quad_envs.envs.team.exchange import N_MOTION
 from quad_envs.envs.team.options import TeamOptions
 from quad_envs.envs.tracking.adjoint import action_slopes
 from quad_envs.lanes import ALIVE, COEFFICIENTS, COMMAND, FORCE_MAX, N_PLANT, PLANT, STEP, WANTED
-from quad_envs.names import shown
 from quad_envs.observations.features import Features
 from quad_envs.parameters import N_COEFFICIENTS
 from quad_envs.plant import N_INPUT, Array
-from quad_envs.table_row import N_TABLE
+from quad_envs.references.table_row import N_TABLE
+from quad_envs.wrappers.encoding import Encoding
 
 from .features import require_measured, training_features
 from .flights import Bools, Floats

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from controllers.mpc.options import MpcOptions
-from quad_envs.names import unknown_name
+from quad_envs.arguments.names import unknown_name
 from quad_envs.parameters import Array
 from quad_envs.tasks import Task, TeamTask
 

@@ -21,10 +21,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from quad_envs.checks import require_choice, require_mappings, require_paths, require_whole, require_words
-from quad_envs.field_comments import called_with
-from quad_envs.kinds import is_number
-from quad_envs.names import shown
+from quad_envs.arguments.checks import (
+    require_choice,
+    require_mappings,
+    require_paths,
+    require_whole,
+    require_words,
+)
+from quad_envs.arguments.field_comments import called_with
+from quad_envs.arguments.kinds import is_number
+from quad_envs.arguments.names import shown
 from quad_envs.parameters import Array
 
 from ..errors import ResultsError, TrainingError

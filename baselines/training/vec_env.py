@@ -17,14 +17,14 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from quad_envs.encoding import Encoding
+from quad_envs.arguments.names import shown
 from quad_envs.envs.team.batch import TeamBatch
 from quad_envs.envs.team.options import TeamOptions, Terminate
 from quad_envs.envs.tracking.batch import TrackingBatch
 from quad_envs.envs.tracking.options import TrackingOptions
-from quad_envs.names import shown
 from quad_envs.observations.features import Features, default_features
 from quad_envs.tasks import Task, TeamTask
+from quad_envs.wrappers.encoding import Encoding
 
 from ..policies.network import Floats
 from .observer import Observer

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_envs.names import shown
+from quad_envs.arguments.names import shown
 from quad_envs.parameters import Array
 
 BoolArray = NDArray[np.bool_]

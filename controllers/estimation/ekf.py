@@ -42,8 +42,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quad_envs.arguments.names import shown
 from quad_envs.compilation.decorators import Int, kernel
-from quad_envs.names import shown
 from quad_envs.parameters import Array
 from quad_envs.sensors import N_MEASUREMENT, SENSORS, sensor_rows
 

@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quad_envs.arguments.names import unknown_name
 from quad_envs.compilation.decorators import Int, inline_kernel, kernel
-from quad_envs.names import unknown_name
 from quad_envs.parameters import Array
 
 from .arguments import BoolArray, IntArray, as_floats, as_mask

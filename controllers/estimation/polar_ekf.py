@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from controllers.qp.linalg import matmul, symmetrise
+from quad_envs.arguments.names import unknown_name
 from quad_envs.compilation.decorators import Int, kernel
-from quad_envs.names import unknown_name
 from quad_envs.parameters import Array
 
 from .arguments import as_floats, require_non_negative

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from quad_envs.names import shown
+from quad_envs.arguments.names import shown
 from quad_envs.parameters import Array
 from quad_envs.sensors import N_MEASUREMENT
 

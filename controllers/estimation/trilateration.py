@@ -24,8 +24,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quad_envs.arguments.names import shown
 from quad_envs.compilation.decorators import kernel
-from quad_envs.names import shown
 from quad_envs.parameters import Array
 
 from .arguments import BoolArray, IntArray, as_floats, as_mask

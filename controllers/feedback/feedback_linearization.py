@@ -21,9 +21,9 @@ from quad_envs.parameters import (
     N_INPUT,
     Array,
 )
+from quad_envs.references.turning import turn_rate
 from quad_envs.rotations import sincos, wrap_angle_scalar
 from quad_envs.tasks import Task
-from quad_envs.turning import turn_rate
 
 from ..controller import TURNING_ROWS, FeedbackLaw, first_non_finite
 from ..fallback import HOVER, NONE, limit_command, yield_yaw

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from quad_envs.checks import require_choice
-from quad_envs.names import shown
+from quad_envs.arguments.checks import require_choice
+from quad_envs.arguments.names import shown
 
 from ..mpc.options import FactorisationOptions, Frame, VelocityReference
 

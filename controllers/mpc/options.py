@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quad_envs.checks import require_choice, require_whole
-from quad_envs.kinds import is_number, require_kinds
+from quad_envs.arguments.checks import require_choice, require_whole
+from quad_envs.arguments.kinds import is_number, require_kinds
+from quad_envs.arguments.names import shown, unknown_name
 from quad_envs.limits import Limits
-from quad_envs.names import shown, unknown_name
 
 from ..controller import MOST_PASSES, require_horizon
 from ..qp.solution import MOST_ITERATIONS

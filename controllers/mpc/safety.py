@@ -18,10 +18,10 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quad_envs.arguments.names import shown
 from quad_envs.compilation.decorators import entry_of, kernel
 from quad_envs.compilation.packed import unpacker
 from quad_envs.limits import LIMITS
-from quad_envs.names import shown
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 from quad_envs.tasks import Task
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quad_envs.kinds import holds_booleans, is_number
-from quad_envs.names import shown
+from quad_envs.arguments.kinds import holds_booleans, is_number
+from quad_envs.arguments.names import shown
 from quad_envs.parameters import MOST_WEIGHT, N_INPUT, Array
 from quad_envs.rotations import sincos
 

@@ -21,8 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_envs.arguments.names import shown
 from quad_envs.compilation.decorators import kernel
-from quad_envs.names import shown
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 
 IntArray = NDArray[np.int64]

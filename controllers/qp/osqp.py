@@ -17,7 +17,7 @@ import numpy as np
 import osqp
 import scipy.sparse as sparse
 
-from quad_envs.checks import require_whole
+from quad_envs.arguments.checks import require_whole
 from quad_envs.parameters import N_INPUT, N_STATE, Array
 
 from .ocp import IntArray, OcpQp, first_move_bounds, validate

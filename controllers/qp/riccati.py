@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 
+from quad_envs.arguments.names import shown
 from quad_envs.compilation.decorators import kernel
-from quad_envs.names import shown
 from quad_envs.parameters import Array
 
 from .linalg import copy, lu_solve, matmul, symmetrise, transpose

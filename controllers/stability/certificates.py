@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
-from quad_envs.names import shown
+from quad_envs.arguments.names import shown
 from quad_envs.parameters import Array
 
 from ..qp import Solution, Status, StructuredSolver

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quad_envs.extras import install_command
+from quad_envs.arguments.extras import install_command
 from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, Array
 from quad_envs.tasks import BaseTask
 

@@ -23,12 +23,12 @@ import osqp
 import scipy.sparse as sparse
 from numpy.typing import ArrayLike, NDArray
 
-from quad_envs.checks import array_bytes, require_memory
+from quad_envs.arguments.checks import array_bytes, require_memory
 from quad_envs.observations.tracking import N_REFERENCE
 from quad_envs.parameters import ATTITUDE, N_INPUT, N_STATE, POSITION, VELOCITY, Array
+from quad_envs.references.turning import TURN_RATE, turning_rates, with_turn_rates
 from quad_envs.rotations import rotation_body_from_inertial, wrap_angle
 from quad_envs.tasks import TeamTask
-from quad_envs.turning import TURN_RATE, turning_rates, with_turn_rates
 
 from ..controller import PLANT_SIZE, Decision, as_array
 from ..fallback import CLIPPED_SDRE, HOVER, NONE, PREVIOUS_PLAN, limit_command

@@ -38,10 +38,10 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from quad_envs.checks import require_choice
+from quad_envs.arguments.checks import require_choice
+from quad_envs.arguments.kinds import require_kinds
+from quad_envs.arguments.names import shown
 from quad_envs.compilation.decorators import inline_kernel, kernel
-from quad_envs.kinds import require_kinds
-from quad_envs.names import shown
 from quad_envs.observations.team import COMM_AGE, COMM_WEIGHT, N_COMM, N_PLAN_STAGE
 from quad_envs.parameters import N_STATE, Array
 from quad_envs.rotations import sincos

@@ -20,9 +20,9 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quad_envs.checks import require_choice
+from quad_envs.arguments.checks import require_choice
+from quad_envs.arguments.kinds import require_kinds
 from quad_envs.compilation.decorators import kernel
-from quad_envs.kinds import require_kinds
 from quad_envs.observations.team import N_COMM, N_PLAN_STAGE
 from quad_envs.observations.tracking import N_REFERENCE
 from quad_envs.parameters import Array

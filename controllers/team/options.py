@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from quad_envs.checks import require_choice, require_whole
-from quad_envs.names import shown
+from quad_envs.arguments.checks import require_choice, require_whole
+from quad_envs.arguments.names import shown
 
 from ..mpc.options import FactorisationOptions, ProblemOptions, VehicleMpcOptions
 from ..qp.solution import MOST_ITERATIONS

@@ -1,1 +1,4 @@
-"""How functions become compiled kernels: compiled, kept on disk, handed their arrays, shared by threads."""
+"""How functions become compiled kernels: compiled, kept on disk, handed their arrays, shared by threads.
+
+`intrinsics`, `tiles` and `normals` are what kernels say in vector instructions: registers, matrices, noise.
+"""

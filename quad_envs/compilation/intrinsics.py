@@ -29,7 +29,7 @@ def _write_stage(
 ) -> None:
     """Write a stage of a preview, eight numbers out[start:]: position - p, velocity, sine, cosine.
 
-    A row of previews, see `table_row`, has the position in doubles. Both arrays are C-contiguous.
+    A row of previews, see `references.table_row`, has the position in doubles. Both arrays are C-contiguous.
     """
     out[start : start + 3] = previews[row, :6].view(np.float64) - np.array(p)
     out[start + 3 : start + 8] = previews[row, 6:11]

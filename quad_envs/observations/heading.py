@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..compilation.decorators import entry_of, kernel
-from ..table_row import N_REFERENCE
+from ..references.table_row import N_REFERENCE
 from .team import AgentLayout
 from .tracking import TrackingLayout
 

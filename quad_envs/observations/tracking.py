@@ -23,9 +23,9 @@ from ..compilation.intrinsics import write_stage
 from ..compilation.packed import IntArray
 from ..lanes import COMMAND, COS_PSI, FORCES, PLANT, SIN_PSI, STEP, four, plus, twelve
 from ..plant import Array
+from ..references.table_row import N_REFERENCE as N_REFERENCE
+from ..references.table_row import SEEN
 from ..rotations import sincos
-from ..table_row import N_REFERENCE as N_REFERENCE
-from ..table_row import SEEN
 
 N_OWN = 18
 Previews = NDArray[np.float32]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..extras import install_command
+from ..arguments.extras import install_command
 
 
 class Window:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..names import shown
+from ..arguments.names import shown
 from ..parameters import Array
 from .plausible import contradiction
 from .spline import Spline, slopes

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..names import shown, unknown_name
+from ..arguments.names import shown, unknown_name
 from ..parameters import Array
 
 _Z_DOWN = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))

@@ -10,8 +10,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..kinds import make_kind, refuse_class, without_booleans
-from ..names import shown, unknown_name
+from ..arguments.kinds import make_kind, refuse_class, without_booleans
+from ..arguments.names import shown, unknown_name
 from .arrays import ArrayTable, from_numbers
 from .functions import FunctionReference
 from .mixture import Mixture

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from ..names import shown, suggestion
+from ..arguments.names import shown, suggestion
 
 NEEDED = ("t", "x", "y", "z")
 VELOCITIES = ("vx", "vy", "vz")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..parameters import Array
-from ..table_row import TURN_RATE
+from .table_row import TURN_RATE
 
 _NEAR = 0.02  # of the episode, by which a table may end earlier or later without a word
 _INSIDE = ("reference", "path")  # fields in which a reference or target holds another

@@ -11,12 +11,12 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..names import shown
+from ..arguments.names import shown
 from ..parameters import Array
 from ..rotations import wrap_angle
-from ..turning import LARGEST_TURN
 from .plausible import contradiction
 from .trajectories import Reference, pack_rows
+from .turning import LARGEST_TURN
 
 _STEP = 1e-3  # s, of the differences where the function gives no velocity
 _CORNER = 1.0  # m/s between the slopes before and after; a smooth path needs 1000 m/s^2 for it

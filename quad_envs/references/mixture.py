@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..checks import Bound, require_number
+from ..arguments.checks import Bound, require_number
 from ..parameters import Array
 from .trajectories import (
     Helix,

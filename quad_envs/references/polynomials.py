@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..names import shown
+from ..arguments.names import shown
 from ..parameters import Array
 from .axes import heading_in_ned, to_ned
 from .text_tables import TextTable

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..names import shown, unknown_name
+from ..arguments.names import shown, unknown_name
 from ..parameters import Array
 from .axes import heading_in_ned, heading_of_quaternions, to_ned
 from .columns import (

@@ -13,16 +13,15 @@ from typing import ClassVar, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import require_whole
+from ..arguments.checks import require_whole
+from ..arguments.kinds import require_kinds
+from ..arguments.names import shown
 from ..compilation.decorators import entry_of, inline_kernel, kernel
 from ..compilation.packed import IntArray
-from ..kinds import require_kinds
-from ..names import shown
-from ..observations.tracking import N_REFERENCE
 from ..parameters import Array
 from ..rotations import sincos
-from ..table_row import COSINE, SINE
 from .plausible import FASTEST
+from .table_row import COSINE, N_REFERENCE, SINE
 
 _RESTING_SPEED = 0.05  # m/s
 _MOST_HARMONICS = 1000

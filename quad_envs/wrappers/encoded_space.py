@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from ..encoding import Encoder, Encoding
-from ..names import shown
+from ..arguments.names import shown
 from ..observations.features import default_features
 from ..observations.tracking import TrackingLayout
 from ..parameters import Limits
 from ..tasks import Task
+from .encoding import Encoder, Encoding
 
 STAGES = (0, 2, 5, 10, 15, 25)  # few, as neighbours say nearly the same
 COMMAND_RANGE = 0.5  # in which the noise of exploration tips nobody over

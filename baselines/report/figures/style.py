@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_envs.extras import install_command
+from quad_envs.arguments.extras import install_command
 from quad_envs.pictures import canvas
 
 from ...errors import MissingPackageError

@@ -7,9 +7,9 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from ...compilation.decorators import inline_kernel
+from ...compilation.normals import draw, drawn_size
 from ...compilation.packed import IntArray
 from ...disturbances import Disturbance, Gusts, blow, gust_numbers
-from ...normals import draw, drawn_size
 from ...plant import N_STATE, Array
 from ...tasks import BaseTask
 

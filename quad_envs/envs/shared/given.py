@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from ...arguments.kinds import holds_booleans
+from ...arguments.names import shown
 from ...formations import FARTHEST
-from ...kinds import holds_booleans
-from ...names import shown
 from ...parameters import N_INPUT, N_STATE, Array
 from .vehicle_options import CRASH_TILT
 

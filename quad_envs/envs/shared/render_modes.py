@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...names import shown
+from ...arguments.names import shown
 
 NO_RENDERING = 'there are no pictures without a render_mode: make the environment with "rgb_array"'
 _SMALLEST, _LARGEST = 160, 4096  # pixels

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from gymnasium.envs.registration import EnvSpec
 
-from ...plain import plain_spec
 from ..tracking.batch import TrackingBatch
+from .plain import plain_spec
 
 
 class Specified:

@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
+from ...arguments.names import shown
 from ...compilation.decorators import entry_of
 from ...disturbances import Disturbance
-from ...names import shown
 from ...observations.tracking import N_REFERENCE
 from ...parameters import Array
 from ...references import Reference, too_fast
 from ...references.plausible import FASTEST
-from ...table_row import N_TABLE
+from ...references.table_row import N_TABLE
+from ...references.turning import tabulate
 from ...tasks import BaseTask
-from ...turning import tabulate
 
 _tabulate = entry_of(tabulate)
 

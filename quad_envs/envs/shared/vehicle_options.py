@@ -10,11 +10,11 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
-from ...checks import Bound, array_bytes, require_number, require_whole
+from ...arguments.checks import Bound, array_bytes, require_number, require_whole
+from ...arguments.kinds import as_tuple, is_number
+from ...arguments.names import shown, suggestion
 from ...disturbances import Disturbance, DisturbanceLike, beyond_authority, disturbance_of
-from ...kinds import as_tuple, is_number
 from ...limits import LimitOptions
-from ...names import shown, suggestion
 from ...parameters import N_STATE, Array, QuadrotorParams, Weights
 from ...references import Reference, in_episode, length_of, make_reference, mismatch
 from ...registration import DT, TIME_LIMIT

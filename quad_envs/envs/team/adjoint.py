@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...adjoint import STAGE_ROWS, forget_saturated, roll_back, roll_out
 from ...compilation.decorators import inline_kernel, kernel
 from ...compilation.packed import IntArray
 from ...constraints import TOLERANCE
@@ -24,6 +23,7 @@ from ...observations.tracking import N_OWN, N_REFERENCE
 from ...parameters import N_INPUT, N_STATE, Array
 from ...reward import stage_cost_kernel
 from ...rotations import sincos
+from ..shared.adjoint import STAGE_ROWS, forget_saturated, roll_back, roll_out
 from ..shared.task_vector import (
     DT,
     HOVER,

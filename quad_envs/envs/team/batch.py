@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...checks import array_bytes, require_memory
+from ...arguments.checks import array_bytes, require_memory
+from ...arguments.names import nearest_name, shown, unknown_name
 from ...compilation.decorators import DirectEntry, entry_of
+from ...compilation.normals import key_of
 from ...compilation.packed import IntArray, pack
 from ...compilation.threads import Threads
 from ...constraints import constraint_scales
@@ -28,13 +30,11 @@ from ...lanes import (
     STEP,
     Blocks,
 )
-from ...names import nearest_name, shown, unknown_name
-from ...normals import key_of
 from ...observations.tracking import N_REFERENCE, tabulate_previews
 from ...plant import N_STATE, Array
 from ...references import make_reference, pack_rows
+from ...references.table_row import N_PREVIEW, N_TABLE
 from ...sensors import sensor_rows
-from ...table_row import N_PREVIEW, N_TABLE
 from ...targets import N_TARGET, make_target
 from ...tasks import TeamTask
 from ..shared.draws import coming, gusts_in_flight, make_draws

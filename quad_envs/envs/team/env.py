@@ -11,9 +11,9 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
+from ...arguments.names import shown
 from ...graphs import GraphTable
 from ...lanes import N_PLANT, PLANT
-from ...names import shown
 from ...plant import Array
 from ...tasks import TeamTask
 from ..shared.render_modes import NO_RENDERING, checked_rendering

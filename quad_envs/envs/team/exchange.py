@@ -18,9 +18,9 @@ from ...lanes import ALIVE, HEARD, LANES, MOST_VALUES, STEP
 from ...observations.team import N_COMM, N_MEASURED, N_PLAN_STAGE, N_SENSED
 from ...observations.tracking import Previews, encode_preview, measured
 from ...plant import Array
+from ...references.table_row import N_PREVIEW, N_REFERENCE, N_TABLE
 from ...rotations import sincos
 from ...sensors import AZIMUTH, RANGE, measure, reads
-from ...table_row import N_PREVIEW, N_REFERENCE, N_TABLE
 from ..shared.task_vector import DT, PREVIEW
 from ..tracking.kernel import encode_vehicle
 

@@ -10,7 +10,9 @@ from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
-from ...checks import Bound, array_bytes, require_number
+from ...arguments.checks import Bound, array_bytes, require_number
+from ...arguments.kinds import is_number
+from ...arguments.names import shown
 from ...formations import (
     FARTHEST,
     FORMATIONS,
@@ -30,8 +32,6 @@ from ...graphs import (
     make_graph_table,
     toward_leader,
 )
-from ...kinds import is_number
-from ...names import shown
 from ...observations.team import N_COMM, N_SENSED, AgentLayout
 from ...observations.tracking import N_REFERENCE
 from ...parameters import Array, QuadrotorParams

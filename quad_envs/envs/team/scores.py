@@ -42,7 +42,7 @@ from ...lanes import (
     twelve,
 )
 from ...plant import Array
-from ...table_row import COSINE, N_TABLE
+from ...references.table_row import COSINE, N_TABLE
 from ...tasks import CRASH_CAUSES, LOSS_PARTS
 from ..shared.task_vector import EPISODE_STEPS, HOVER, QUADRATIC, TILT_OF_CRASH
 from ..tracking.kernel import compare, score, stage_cost_in_lanes, weights

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from ...checks import require_whole
+from ...arguments.checks import require_whole
 from ...lanes import N_PLANT, PLANT
 from ...plant import Array
 from ...tasks import TeamTask

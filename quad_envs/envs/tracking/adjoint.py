@@ -1,7 +1,7 @@
 """The tracking task as a differentiable function: its step and reward, and their adjoints, for many flights.
 
 For policy gradients through the dynamics. The forward pass is the environments' own kernel; the backward pass
-is `quad_envs.adjoint` for the motion and `reward_vjp_rows` here for the reward.
+is `quad_envs.envs.shared.adjoint` for the motion and `reward_vjp_rows` here for the reward.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...adjoint import SCRATCH_ROWS, step_vjp_kernel
 from ...compilation.decorators import kernel
 from ...constraints import TOLERANCE
 from ...parameters import N_STATE, Array
 from ...reward import stage_cost_kernel
 from ...rotations import sincos, wrap_angle_scalar
+from ..shared.adjoint import SCRATCH_ROWS, step_vjp_kernel
 from ..shared.task_vector import (
     ACTION_MAX,
     DT,

@@ -8,18 +8,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...checks import array_bytes, require_memory
+from ...arguments.checks import array_bytes, require_memory
+from ...arguments.names import shown
 from ...compilation.decorators import DirectEntry, entry_of
+from ...compilation.normals import key_of
 from ...compilation.packed import IntArray, pack
 from ...compilation.threads import Threads
 from ...disturbances import Disturbance
 from ...lanes import LANES, N_PLANT, N_TRACKING, STEP, Blocks
-from ...names import shown
-from ...normals import key_of
 from ...observations.tracking import tabulate_previews
 from ...plant import N_STATE, POSITION, Array
 from ...references import RandomSmooth, Reference, make_reference, state_on
-from ...table_row import N_PREVIEW, N_TABLE
+from ...references.table_row import N_PREVIEW, N_TABLE
 from ...tasks import Task
 from ..shared.draws import coming, gusts_in_flight, make_draws
 from ..shared.given import given_plants

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ...episode_limit import steps_asked
 from ...lanes import N_PLANT, PLANT
 from ...plant import Array
-from ...table_row import N_REFERENCE
+from ...references.table_row import N_REFERENCE
 from ...tasks import Task
 from ..shared.render_modes import NO_RENDERING, RenderModes, checked_rendering
 from ..shared.specified import Specified

@@ -56,8 +56,8 @@ from ...observations.tracking import (
     measured,
 )
 from ...plant import N_INPUT, N_STATE, Array
+from ...references.table_row import N_PREVIEW, N_TABLE
 from ...reward import stage_cost_parts
-from ...table_row import N_PREVIEW, N_TABLE
 from ...tasks import CRASH_CAUSES
 from ..shared.actions import first_unsound
 from ..shared.draws import Draws, draw_ahead

@@ -9,14 +9,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ...checks import array_bytes
-from ...kinds import is_number
-from ...names import shown
+from ...arguments.checks import array_bytes
+from ...arguments.kinds import is_number
+from ...arguments.names import shown
 from ...observations.tracking import N_REFERENCE, TrackingLayout
 from ...parameters import N_STATE, POSITION, Array
 from ...references import ReferenceLike
+from ...references.table_row import N_TABLE
 from ...registration import TIME_LIMIT, TRACKING
-from ...table_row import N_TABLE
 from ...tasks import Task
 from ..shared.given import MOST_STATE
 from ..shared.vehicle_options import CRASH_TILT, MOST_PREVIEW, MOST_STEPS, VehicleOptions

@@ -12,10 +12,10 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from ...checks import require_whole
+from ...arguments.checks import require_whole
 from ...lanes import N_PLANT, PLANT
 from ...plant import Array
-from ...table_row import N_REFERENCE
+from ...references.table_row import N_REFERENCE
 from ...tasks import Task
 from ..shared.given import as_numbers, given_plants
 from ..shared.render_modes import NO_RENDERING, checked_rendering

@@ -12,9 +12,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .compilation.decorators import inline_kernel, kernel
-from .plant import Array
-from .rotations import wrap_angle
+from ..compilation.decorators import inline_kernel, kernel
+from ..plant import Array
+from ..rotations import wrap_angle
 from .table_row import HEADING, N_REFERENCE, N_TABLE
 from .table_row import TURN_RATE as TURN_RATE
 

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .kinds import is_number
-from .names import shown
-from .observations.features import Features
-from .observations.heading import HeadingAxes
-from .parameters import Array
-from .tasks import BaseTask, Task, TeamTask
+from ..arguments.kinds import is_number
+from ..arguments.names import shown
+from ..observations.features import Features
+from ..observations.heading import HeadingAxes
+from ..parameters import Array
+from ..tasks import BaseTask, Task, TeamTask
 
 Floats = NDArray[np.float32]
 

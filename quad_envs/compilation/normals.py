@@ -12,9 +12,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from .compilation.decorators import inline_lane_kernel, lane_kernel
-from .compilation.intrinsics import bits_of, number_of
-from .plant import Array
+from ..plant import Array
+from .decorators import inline_lane_kernel, lane_kernel
+from .intrinsics import bits_of, number_of
 
 PER_BLOCK = 4  # numbers of a counter
 _TOGETHER = 16  # a multiple of which is drawn: four counters side by side

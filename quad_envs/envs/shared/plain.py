@@ -12,13 +12,13 @@ import numpy as np
 from gymnasium import registry
 from gymnasium.envs.registration import EnvSpec
 
-from .disturbances import DISTURBANCES
-from .episode_limit import SuiteSpec
-from .graphs import KINDS as SCHEDULES
-from .graphs import edges_of, is_networkx
-from .kinds import mapping_of
-from .references import REFERENCES, is_frame
-from .targets import TARGETS
+from ...arguments.kinds import mapping_of
+from ...disturbances import DISTURBANCES
+from ...episode_limit import SuiteSpec
+from ...graphs import KINDS as SCHEDULES
+from ...graphs import edges_of, is_networkx
+from ...references import REFERENCES, is_frame
+from ...targets import TARGETS
 
 _KINDS = {**REFERENCES, **TARGETS, **DISTURBANCES, **SCHEDULES}
 

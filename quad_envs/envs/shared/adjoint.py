@@ -12,10 +12,10 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .compilation.decorators import inline_kernel, kernel
-from .dynamics import rigid_body, rotor_limits
-from .names import shown
-from .parameters import (
+from ...arguments.names import shown
+from ...compilation.decorators import inline_kernel, kernel
+from ...dynamics import rigid_body, rotor_limits
+from ...parameters import (
     DRAG_RATE,
     GRAVITY,
     GYRO_X,
@@ -33,7 +33,7 @@ from .parameters import (
     Array,
     QuadrotorParams,
 )
-from .rotations import sincos
+from ...rotations import sincos
 
 _PLANT = N_STATE + N_INPUT
 _MOST_SUBSTEPS = 64
