@@ -8,21 +8,13 @@ from baselines import evaluate, make_policy
 from controllers import ExactNmpc, FeedbackLinearization, LinearMPC, Lqr, SdcNmpc, Sdre
 from controllers.team.central import CentralMpc
 from quad_envs.compilation.decorators import kernel
-from quad_envs.dynamics import derivative_reference, rigid_body, rotor_shares, simulate
+from quad_envs.dynamics import rotor_shares, simulate
 from quad_envs.envs.shared.adjoint import step_vjp
 from quad_envs.lanes import FORCE_MAX
-from quad_envs.parameters import RATES, Limits, QuadrotorParams
+from quad_envs.parameters import FRAMES, RATES, Limits, QuadrotorParams
 from quad_envs.tasks import Task, TeamTask
 
 UNEVEN = (0.5, 0.3, 1.5, 0.8)  # of the weight
-FRAMES = ["plus", "x"]
-
-
-@kernel
-def _derivative(x, F, d, c, out):
-    rates = rigid_body(x, F, d, c)
-    for i in range(12):
-        out[i] = rates[i]
 
 
 @kernel
@@ -46,14 +38,11 @@ def test_torques_are_the_moments_of_forces_along_minus_z_at_the_rotors(frame):
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_the_compiled_derivative_and_the_split_among_rotors_know_the_frame(frame):
+def test_the_compiled_split_among_rotors_knows_the_frame(frame):
     rng = np.random.default_rng(0)
     params = QuadrotorParams(frame=frame, inertia=(0.02, 0.025, 0.04), drag=0.1)
-    out, shares = np.empty(12), np.empty(4)
+    shares = np.empty(4)
     for _ in range(50):
-        x, F, d = rng.normal(size=12), rng.uniform(0, 5, 4), rng.normal(size=6)
-        _derivative(x, F, d, params.coefficients(), out)
-        np.testing.assert_allclose(out, derivative_reference(x, F, params, d[:3], d[3:]), atol=1e-11)
         alpha = rng.normal(size=3)
         _shares(alpha, params.coefficients(), shares)
         wanted = np.linalg.solve(params.mixer(), np.r_[0.0, alpha * params.inertia])

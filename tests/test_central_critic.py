@@ -27,17 +27,9 @@ from quad_envs.envs.tracking.options import TrackingOptions
 TEAM = FormationOptions(vehicles=3, time_limit=2.0)
 SMALL = MappoOptions(n_envs=6, n_steps=24, batch_size=48, n_epochs=2, net_arch=(16,), critic_arch=(24, 8))
 FORMATION = "quad/Formation-v0"
+pytestmark = pytest.mark.usefixtures("one_thread")
 LIKE = {"net_arch": [128, 128], "stages": [0, 2, 5]}
 TURN_OVER = np.array([0.9, -0.9, -0.9, 0.9], dtype=np.float32)
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """As in a run: two threads on networks this small wait for each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def inertial(plant):

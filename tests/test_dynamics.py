@@ -11,7 +11,7 @@ from quad_envs.dynamics import (
     simulate,
 )
 from quad_envs.lanes import LANES
-from quad_envs.parameters import QuadrotorParams
+from quad_envs.parameters import FRAMES, QuadrotorParams
 from quad_envs.rotations import (
     euler_rate_matrix,
     rotation_body_from_inertial,
@@ -58,9 +58,10 @@ def test_derivative_at_the_published_point():
     np.testing.assert_allclose(derivative_reference(ANCHOR_X, ANCHOR_F, PARAMS), expected, atol=1e-8)
 
 
-def test_compiled_derivative_equals_the_readable_one():
+@pytest.mark.parametrize("frame", FRAMES)
+def test_compiled_derivative_equals_the_readable_one(frame):
     rng = np.random.default_rng(0)
-    params = QuadrotorParams(mass=1.1, inertia=(0.02, 0.03, 0.05), drag=0.3)
+    params = QuadrotorParams(mass=1.1, inertia=(0.02, 0.03, 0.05), drag=0.3, frame=frame)
     for x in random_states(rng, 200):
         F, d, out = rng.uniform(0, 8, 4), rng.normal(size=6), np.empty(12)
         _derivative(x, F, d, params.coefficients(), out)

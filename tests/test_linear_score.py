@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from flights import HOVER, TASK, at_rest, calm, decide_once, held_under, helix, plan_of, rest, window
+from rows_alone import require_equal_alone
 from scipy.optimize import lsq_linear
 
 from baselines import evaluate, make_policy
@@ -162,17 +163,10 @@ def test_an_objective_or_floor_that_means_nothing_is_refused(name, options, mess
 @pytest.mark.parametrize("options", [{}, {"R_rate": 1.0, "reject_disturbance": True}])
 @pytest.mark.parametrize("kind", [LinearMPC, SdcNmpc])
 def test_rows_decide_as_single_vehicles_do(kind, options):
-    rng, n = np.random.default_rng(1), 5
+    rng = np.random.default_rng(1)
     mpc = kind(TASK, objective="score", **options)
-    plants = FAR + rng.normal(0.0, 0.3, (n, 16))
-    rows = np.repeat(window(helix, 0, N)[None], n, axis=0)
-    last, zero = np.full((n, 4), HOVER), np.zeros((n, 6))
-    memory = mpc.decide(plants, rows, last, zero, np.zeros((n, mpc.memory_size))).memory
-    together = mpc.decide(plants, rows, last, zero, memory)
-    for j in range(n):
-        alone = decide_once(mpc, plants[j], rows[j], memory=memory[j])
-        np.testing.assert_array_equal(alone.command[0], together.command[j])
-        np.testing.assert_array_equal(alone.memory[0], together.memory[j])
+    plants = FAR + rng.normal(0.0, 0.3, (5, 16))
+    require_equal_alone(mpc, plants)
 
 
 @pytest.mark.parametrize("name", ["lmpc", "sdc-nmpc"])

@@ -7,6 +7,7 @@ import math
 import gymnasium
 import numpy as np
 import pytest
+from made_episodes import hovering
 
 import quad_envs  # noqa: F401  registers the ids
 from baselines import estimate, make_policy, measure, paired_difference, run_episodes
@@ -14,36 +15,14 @@ from baselines.evaluation.column import CUT_SHORT
 from baselines.evaluation.columns import averaged
 from baselines.evaluation.evaluate import Evaluation
 from baselines.evaluation.metrics import decision_quantiles, summarize, totals
-from baselines.evaluation.rollout import Episode
 from quad_envs import Limits, Task
-from quad_envs.constraints import constraint_names
 
 STEPS = 200
 
 
 def flight(task=None, **changes):
     """A flight of full length: at the reference, hovering, within limits."""
-    task = task or Task()
-    n = len(constraint_names(task.limits))
-    values = {
-        "task": task,
-        "seed": 0,
-        "states": np.zeros((STEPS + 1, 16)),
-        "references": np.zeros((STEPS + 1, 8)),
-        "commands": np.full((STEPS, 4), task.hover_force),
-        "rewards": np.ones(STEPS),
-        "stage_costs": np.zeros(STEPS),
-        "costs": np.zeros(STEPS),
-        "violations": np.zeros(STEPS, dtype=bool),
-        "constraint_values": np.zeros((STEPS, n)),
-        "decision_times": np.full(STEPS, 1e-4),
-        "fallbacks": np.array([STEPS, 0, 0, 0, 0]),
-        "worst_iterations": 0,
-        "crashed": False,
-        "terminated": False,
-        "truncated": True,
-    }
-    return Episode(**(values | changes))
+    return hovering(task or Task(), STEPS, **changes)
 
 
 def test_a_perfect_flight_scores_one():

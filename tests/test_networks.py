@@ -181,7 +181,7 @@ def test_every_tile_sums_in_the_order_of_the_inputs_and_rounds_once_a_term(n):
         assert np.array_equal(found[:, m:64], np.zeros((4, 4)))  # of the padding
         assert np.isnan(found[:, 64:]).all()
     readable = np.zeros(4 * width, np.float32)
-    tiles._multiply(4, 4, x.ravel(), 0, width, n, tiles.packed(W, b), 0, readable, 0)
+    tiles._plain(4, 4)(x.ravel(), 0, width, n, tiles.packed(W, b), 0, readable, 0)
     assert readable.reshape(4, width)[:, :64].tobytes() == out[0].reshape(4, width)[:, :64].tobytes()
 
 

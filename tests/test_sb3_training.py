@@ -50,18 +50,10 @@ from quad_envs.registration import TRACKING
 from quad_envs.wrappers import FilterAndRescale
 from quad_envs.wrappers.encoding import hover_actions
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 HELIX, SPIRAL = "quad/HelixTracking-v0", "quad/SpiralTracking-v0"
 SHORT = {"reference": "random", "time_limit": 1.0, "preview": 3}
 SMALL = PpoOptions(n_envs=8, n_steps=16, batch_size=64, n_epochs=2, net_arch=(16, 16))
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """As in a run: two threads on networks this small wait for each other, on busy cores for minutes."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def random_outputs(rng, rows, size=4):

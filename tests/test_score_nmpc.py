@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from flights import DT, HOVER, TASK, at_rest, calm, decide_once, held_under, helix, plan_of, rest, window
+from rows_alone import require_equal_alone
 from test_nmpc import STATE, ipopt_plan, turning_window
 
 from baselines import evaluate, make_policy
@@ -147,16 +148,9 @@ def test_an_objective_or_floor_that_means_nothing_is_refused(options, message):
 
 def test_rows_decide_as_single_vehicles_do():
     rng = np.random.default_rng(1)
-    mpc, n = ExactNmpc(TASK, objective="score"), 5
-    plants = STATE + rng.normal(0.0, 0.3, (n, 16))
-    rows = np.repeat(window(helix, 0, N)[None], n, axis=0)
-    last, zero = np.full((n, 4), HOVER), np.zeros((n, 6))
-    memory = mpc.decide(plants, rows, last, zero, np.zeros((n, mpc.memory_size))).memory
-    together = mpc.decide(plants, rows, last, zero, memory)
-    for j in range(n):
-        alone = decide_once(mpc, plants[j], rows[j], memory=memory[j])
-        np.testing.assert_array_equal(alone.command[0], together.command[j])
-        np.testing.assert_array_equal(alone.memory[0], together.memory[j])
+    mpc = ExactNmpc(TASK, objective="score")
+    plants = STATE + rng.normal(0.0, 0.3, (5, 16))
+    require_equal_alone(mpc, plants)
 
 
 @pytest.mark.parametrize("env_id", ["quad/HelixTracking-v0", "quad/SpiralTracking-v0", "quad/Regulation-v0"])

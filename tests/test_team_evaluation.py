@@ -8,11 +8,11 @@ import pickle
 
 import numpy as np
 import pytest
+from made_episodes import hovering
 
 from baselines import evaluate, load_suite, make_policy, measure, run_benchmark, run_episodes
 from baselines.__main__ import main
 from baselines.evaluation.columns import Record
-from baselines.evaluation.episode import Episode
 from baselines.evaluation.evaluate import Evaluation
 from baselines.evaluation.metrics import estimate, paired_difference, summarize, totals
 from baselines.evaluation.team_metrics import flight_values
@@ -69,27 +69,8 @@ def flight(task=None, agent="quad_0", **changes):
         "messages": np.full(STEPS, 2),
         "reward_terms": np.zeros((STEPS, 6 + n)),
     }
-    values = {
-        "task": task,
-        "seed": 0,
-        "states": np.zeros((STEPS + 1, 16)),
-        "references": np.zeros((STEPS + 1, 8)),
-        "commands": np.full((STEPS, 4), task.hover_force),
-        "rewards": np.ones(STEPS),
-        "stage_costs": np.zeros(STEPS),
-        "costs": np.zeros(STEPS),
-        "violations": np.zeros(STEPS, dtype=bool),
-        "constraint_values": np.zeros((STEPS, n)),
-        "decision_times": np.full(STEPS, 1e-4),
-        "fallbacks": np.array([STEPS, 0, 0, 0, 0]),
-        "worst_iterations": 0,
-        "crashed": False,
-        "terminated": False,
-        "truncated": True,
-        "agent": agent,
-        "team_size": 2,
-    }
-    return Episode(**(values | {"signals": signals | changes.pop("signals", {})} | changes))
+    signals |= changes.pop("signals", {})
+    return hovering(task, STEPS, **({"agent": agent, "team_size": 2, "signals": signals} | changes))
 
 
 def team(columns, seed=0):

@@ -27,9 +27,8 @@ def read_value(text: str) -> Any:
     try:
         return _scalar(text)
     except ValueError:
-        pass
-    if not text.lstrip().startswith(("{", "[")):
-        return text
+        if not text.lstrip().startswith(("{", "[")):
+            return text
     value, end = _value(text, 0)
     end = _skip(text, end)
     if end < len(text):

@@ -133,7 +133,7 @@ class _Run:
         plan, more = self.plan, {} if self.start.network is None else {"start": self.start.network}
         # A resumed run draws other flights than those it has seen.
         seed = plan.seed + 1_000_003 * self.start.resumed
-        with _one_thread():
+        with one_thread():
             updates = generator_of(plan.algorithm)(plan.task_options, plan.options, seed, self.share, **more)
             self._watchers += tensorboard_log(self.folder.path / "tensorboard")
             try:
@@ -257,7 +257,7 @@ def limit_of(plan: Plan) -> float | None:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """Networks this small train faster on one thread, and CPU-seconds compare."""
     try:
         import torch

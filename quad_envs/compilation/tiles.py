@@ -34,50 +34,45 @@ def packed(weights: Floats, bias: Floats) -> Floats:
     return np.ascontiguousarray(rows.reshape(n + 1, -1, STRIP).swapaxes(0, 1)).ravel()
 
 
-def _multiply(
-    rows: int,
-    strips: int,
-    x: Floats,
-    x_at: int,
-    width: int,
-    n: int,
-    weights: Floats,
-    at: int,
-    out: Floats,
-    out_at: int,
-) -> None:
-    """Write bias + weights x for so many rows and strips of outputs.
+def _plain(rows: int, strips: int) -> Any:
+    """A function that writes bias + weights x for so many rows and strips of outputs, in readable numpy."""
 
-    Args:
-        rows: Of the tile.
-        strips: Of the tile.
-        x: Inputs, flat.
-        x_at: Where the first row begins.
-        width: From row to row, of x and of out.
-        n: Number of inputs.
-        weights: As `packed` gives them.
-        at: Where the first strip begins.
-        out: Result, flat.
-        out_at: Where the first output of the first row goes.
-    """
-    for r in range(rows):
-        for strip in range(strips):
-            begin = at + strip * (n + 1) * STRIP
-            terms = weights[begin : begin + (n + 1) * STRIP].reshape(n + 1, STRIP)
-            total = terms[n]
-            for i in range(n):  # the product of two floats is exact in doubles
-                total = (np.float64(x[x_at + r * width + i]) * terms[i] + total).astype(np.float32)
-            start = out_at + r * width + strip * STRIP
-            out[start : start + STRIP] = total
+    def multiply(
+        x: Floats, x_at: int, width: int, n: int, weights: Floats, at: int, out: Floats, out_at: int
+    ) -> None:
+        """Write the outputs of one tile; arrays are flat.
+
+        Args:
+            x: Inputs.
+            x_at: Where the first row begins.
+            width: From row to row, of x and of out.
+            n: Number of inputs.
+            weights: As `packed` gives them.
+            at: Where the first strip begins.
+            out: Result.
+            out_at: Where the first output of the first row goes.
+        """
+        for r in range(rows):
+            for strip in range(strips):
+                begin = at + strip * (n + 1) * STRIP
+                terms = weights[begin : begin + (n + 1) * STRIP].reshape(n + 1, STRIP)
+                total = terms[n]
+                for i in range(n):  # the product of two floats is exact in doubles
+                    total = (np.float64(x[x_at + r * width + i]) * terms[i] + total).astype(np.float32)
+                start = out_at + r * width + strip * STRIP
+                out[start : start + STRIP] = total
+
+    return multiply
 
 
 def _tile(rows: int, strips: int) -> Any:
-    """`_multiply` of so many rows and strips, sums in registers."""
+    """What `_plain` makes, for compiled kernels: sums in registers."""
     vector, lane, word = ir.VectorType(ir.FloatType(), _LANES), ir.IntType(32), ir.IntType(64)
     first, mask = ir.Constant(lane, 0), ir.Constant(ir.VectorType(lane, _LANES), [0] * _LANES)
     parts = STRIP // _LANES  # registers of a strip
 
-    def in_registers(
+    @intrinsic
+    def multiply(
         typing: Any, x: Any, x_at: Any, width: Any, n: Any, weights: Any, at: Any, out: Any, out_at: Any
     ) -> Any:
         def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -122,13 +117,6 @@ def _tile(rows: int, strips: int) -> Any:
 
         whole = types.intp
         return types.void(x, whole, whole, whole, weights, whole, out, whole), generate
-
-    return intrinsic(in_registers)
-
-
-def _plain(rows: int, strips: int) -> Any:
-    def multiply(*arguments: Any) -> None:
-        _multiply(rows, strips, *arguments)
 
     return multiply
 

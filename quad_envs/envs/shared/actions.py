@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 from ...compilation.decorators import kernel
 
+FLOAT32 = np.dtype(np.float32)  # of actions and observations; numpy takes longer to read `np.float32`
+
 
 @kernel
 def first_unsound(actions: NDArray[np.float32]) -> int:

@@ -16,6 +16,7 @@ from ...graphs import GraphTable
 from ...lanes import N_PLANT, PLANT
 from ...plant import Array
 from ...tasks import TeamTask
+from ..shared.actions import FLOAT32
 from ..shared.render_modes import NO_RENDERING, checked_rendering
 from .batch import TeamBatch
 from .options import TeamOptions
@@ -30,7 +31,6 @@ Named = dict[str, Any]
 # PettingZoo asks for finite bounds; no state of a flight within the arena comes near.
 _BOUND = 1e6
 _FIRST = np.zeros(1, dtype=np.int64)  # the batch's only team
-_FLOAT32 = np.dtype(np.float32)
 _ndim, _dtype = attrgetter("ndim"), attrgetter("dtype")
 _METADATA: dict[str, Any] = {
     "render_modes": ["human", "rgb_array"],
@@ -195,7 +195,7 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
         try:
             rows: Any = self._of_each(actions) if len(agents) > 1 else [actions[name] for name in agents]
             fits = set(map(len, rows)) == {size} and len(actions) == len(agents)
-            if set(map(_ndim, rows)) == {1} and list(map(_dtype, rows)) == [_FLOAT32] * len(rows):
+            if set(map(_ndim, rows)) == {1} and list(map(_dtype, rows)) == [FLOAT32] * len(rows):
                 joined = np.frombuffer(b"".join(rows), dtype=np.float32)  # the quickest way for many
             else:
                 joined = np.concatenate(rows, dtype=np.float32, casting="same_kind")

@@ -15,6 +15,7 @@ from ...lanes import N_PLANT, PLANT
 from ...plant import Array
 from ...references.table_row import N_REFERENCE
 from ...tasks import Task
+from ..shared.actions import FLOAT32
 from ..shared.render_modes import NO_RENDERING, RenderModes, checked_rendering
 from ..shared.specified import Specified
 from .batch import TrackingBatch
@@ -31,7 +32,6 @@ _Step = tuple[Observation, float, bool, bool, dict[str, Any]]
 # clipped actions, cause; crashed, truncated, violated.
 _unpack = Struct("4d2q3?5x").unpack_from
 _ONE = np.zeros(1, dtype=np.int64)
-_FLOAT32 = np.dtype(np.float32)
 
 
 class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -168,10 +168,10 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
         """Hold the rotor commands over one control period."""
         if self._np_random is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        actions = np.ascontiguousarray(action, _FLOAT32)
+        actions = np.ascontiguousarray(action, FLOAT32)
         if actions.shape != (4,):
             raise ValueError(f"action must have shape (4,), one entry per rotor, got {actions.shape}")
-        observation = np.empty(self._size, _FLOAT32)
+        observation = np.empty(self._size, FLOAT32)
         self._batch.step(actions, observation, self._told)
         if self._pictures:
             self._pictures.record()

@@ -17,6 +17,7 @@ from ...lanes import N_PLANT, PLANT
 from ...plant import Array
 from ...references.table_row import N_REFERENCE
 from ...tasks import Task
+from ..shared.actions import FLOAT32
 from ..shared.given import as_numbers, given_plants
 from ..shared.render_modes import NO_RENDERING, checked_rendering
 from ..shared.specified import Specified
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 
 Observations = NDArray[np.float32]
 Bools = NDArray[np.bool_]
-_FLOAT32 = np.dtype(np.float32)
 _Step = tuple[Observations, Array, Bools, Bools, dict[str, Any]]
 
 
@@ -139,7 +139,7 @@ class TrackingVectorEnv(
 
     def step(self, actions: NDArray[np.float32]) -> _Step:
         """Hold the rotor commands of all flights over one control period."""
-        actions = np.ascontiguousarray(actions, _FLOAT32)
+        actions = np.ascontiguousarray(actions, FLOAT32)
         if actions.shape != (self.num_envs, 4):
             raise ValueError(f"actions must have shape ({self.num_envs}, 4), got {actions.shape}")
         if not self._generators:
@@ -204,4 +204,4 @@ class TrackingVectorEnv(
         return fresh
 
     def _fresh_observations(self) -> Observations:
-        return np.empty(self._shape, _FLOAT32)
+        return np.empty(self._shape, FLOAT32)
