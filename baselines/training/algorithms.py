@@ -1,12 +1,13 @@
 """The training algorithms by name. One is a generator; everything around it is in `runs`.
 
-    train(task_options, options, seed, spent, start=None) -> Iterator[tuple[Progress, Network]]
+    train(task_options, options, seed, spent, start=None) -> Training
 
 `task_options` are the TrackingOptions or team options of the environment, `options` the algorithm's
-hyperparameters (a frozen dataclass), `spent()` the share of the budget that is used up: the generator ends at
-1, and yields after each update. `start` is a network to go on from, for --resume; a generator without this
-argument cannot be resumed. `check(task_options, options, start)` in its module, if there is one, refuses what
-the generator would, before anything is written.
+hyperparameters (a frozen dataclass), `seed` that of everything random, `spent()` the share of the budget that
+is used up, 0 to 1: the generator ends at 1, and yields after each update how far it is and the network.
+`start` is a network to go on from, for --resume; a generator without this argument cannot be resumed.
+`check(task_options, options, start)` in its module, if there is one, refuses what the generator would, before
+anything is written.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import inspect
 from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from quad_envs.arguments.extras import install_command
 from quad_envs.arguments.names import unknown_name
@@ -29,6 +30,9 @@ from .algorithm_options import (
     PpoOptions,
     SacOptions,
 )
+
+if TYPE_CHECKING:
+    from .held_out import Training
 
 TRACKING, FORMATION, TARGET, ESTIMATION = "tracking", "formation", "target-tracking", "estimation"
 
@@ -149,10 +153,10 @@ def require_packages(name: str) -> None:
         )
 
 
-def generator_of(name: str) -> Callable[..., Any]:
+def generator_of(name: str) -> Callable[..., Training]:
     """The generator function of an algorithm."""
     entry = ALGORITHMS[name]
-    found: Callable[..., Any] = getattr(import_module(entry.module, __package__), entry.generator)
+    found: Callable[..., Training] = getattr(import_module(entry.module, __package__), entry.generator)
     return found
 
 

@@ -8,7 +8,7 @@ their team it is a truncation, after which they have what the critic expects.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -28,7 +28,7 @@ from quad_envs.tasks import TeamTask
 from ..policies.network import Floats, Network
 from . import sb3
 from .algorithm_options import MappoOptions
-from .held_out import Progress
+from .held_out import Training
 from .learner import Tanh
 from .sb3 import flights_of, make_ppo, updates
 from .vec_env import Bools, TaskOptions, TrainingVecEnv
@@ -195,18 +195,8 @@ def train(
     seed: int,
     spent: Callable[[], float],
     start: Network | None = None,
-) -> Iterator[tuple[Progress, Network]]:
+) -> Training:
     """Train with PPO and a critic of the whole team; otherwise as `sb3.train_ppo`.
-
-    Args:
-        task_options: Of the environment.
-        options: Hyperparameters.
-        seed: Of everything random.
-        spent: Share of the budget that is used up, 0 to 1; training ends at 1.
-        start: Actor to go on from; the critic learns anew, see `critic_updates`.
-
-    Yields:
-        After each update, how far it is and the actor without its noise.
 
     Raises:
         ValueError: See `check`; or `start` has other layers.

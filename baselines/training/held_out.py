@@ -7,9 +7,9 @@ that those from 10 000 to 19 999 stay untouched for comparisons.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import gymnasium
 import numpy as np
@@ -35,6 +35,9 @@ class Progress(NamedTuple):
     update: int
     steps: int
     reward: float  # mean of the last update, as the algorithm saw it; nan if not known
+
+
+Training: TypeAlias = Generator[tuple[Progress, Network], None, None]  # after each update, what flies by now
 
 
 class Point(NamedTuple):

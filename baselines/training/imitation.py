@@ -7,7 +7,7 @@ observation shows cannot be imitated by a network that remembers nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +30,7 @@ from ..policies.registry import is_trained, make_policy, policy_options
 from .algorithm_options import DaggerOptions
 from .beginning import require_continuable
 from .features import require_measured, training_features
-from .held_out import Progress
+from .held_out import Progress, Training
 from .observer import Observer
 from .policy_gradient import Actor
 
@@ -217,15 +217,8 @@ def train(
     seed: int,
     spent: Callable[[], float],
     start: Network | None = None,
-) -> Iterator[tuple[Progress, Network]]:
-    """Train, and yield after each window.
-
-    Args:
-        task_options: Of the environment.
-        options: Hyperparameters.
-        seed: Of everything random.
-        spent: Share of the budget that is used up, 0 to 1; training ends at 1.
-        start: To go on from; a new network if not given.
+) -> Training:
+    """Train, see `algorithms`, and yield after each window.
 
     Raises:
         ValueError: If the expert is not allowed.

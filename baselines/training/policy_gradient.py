@@ -9,7 +9,7 @@ In a team all vehicles share the network, and each one's objective moves those t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -28,7 +28,7 @@ from .beginning import require_continuable
 from .differentiable import Flights, S
 from .features import require_own_axes, training_features
 from .flights import DifferentiableFlights
-from .held_out import Progress
+from .held_out import Progress, Training
 from .team_flights import DifferentiableTeams, require_differentiable
 
 
@@ -168,15 +168,8 @@ def train(
     seed: int,
     spent: Callable[[], float],
     start: Network | None = None,
-) -> Iterator[tuple[Progress, Network]]:
-    """Train, and yield after each update.
-
-    Args:
-        task_options: Of the environment.
-        options: Hyperparameters.
-        seed: Of everything random.
-        spent: Share of the budget that is used up, 0 to 1; training ends at 1.
-        start: To go on from; a new network if not given.
+) -> Training:
+    """Train, see `algorithms`, and yield after each update.
 
     Raises:
         ValueError: If the task cannot be differentiated.

@@ -20,7 +20,7 @@ from ..interruptions import held, raise_lost, remembered
 from ..policies.network import Network
 from .algorithms import generator_of, require_resumable
 from .clock import TrainingClock
-from .held_out import CHOOSING, HeldOutFlights, Point, Progress, better
+from .held_out import CHOOSING, HeldOutFlights, Point, Progress, Training, better
 from .plans import Plan, Start, make_plan, read_start
 from .request import TrainingRequest
 from .run_folder import RunFolder
@@ -150,7 +150,7 @@ class _Run:
         """Share of the budget that is used up."""
         return self.budget.share(self.clock.seconds, self.progress.steps)
 
-    def _turn(self, updates: Iterator[tuple[Any, Network]]) -> None:
+    def _turn(self, updates: Training) -> None:
         """Update after update."""
         while True:
             raise_lost()

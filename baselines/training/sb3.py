@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Any, TypeVar
 
@@ -29,7 +29,7 @@ from ..policies.network import Network
 from .algorithm_options import PpoLagrangianOptions, PpoOptions, SacOptions
 from .beginning import require_continuable
 from .features import require_measured, training_features
-from .held_out import Progress
+from .held_out import Progress, Training
 from .lagrangian import LagrangianBuffer, LagrangianEnv, Multiplier, Probe
 from .learner import RowBuffer, RowPPO, Tanh
 from .vec_env import TaskOptions, TrainingVecEnv
@@ -60,19 +60,11 @@ def train_ppo(
     seed: int,
     spent: Callable[[], float],
     start: Network | None = None,
-) -> Iterator[tuple[Progress, Network]]:
-    """Train with PPO; all vehicles of a team share the network.
+) -> Training:
+    """Train with PPO, see `algorithms`; vehicles of a team share the network, which comes without its noise.
 
-    Args:
-        task_options: Of the environment.
-        options: Hyperparameters.
-        seed: Of everything random.
-        spent: Share of the budget that is used up, 0 to 1; training ends at 1.
-        start: Policy to go on from. Its critic and its noise are not known: the critic learns anew, and the
-            policy stands still for the first `critic_updates`.
-
-    Yields:
-        After each update, how far it is and the policy without its noise.
+    Of `start` neither critic nor noise is known: the critic learns anew, and the policy stands still for the
+    first `critic_updates`.
 
     Raises:
         ValueError: If actions of the task are no rotor commands, or `start` has other layers.
@@ -89,7 +81,7 @@ def train_ppo_lagrangian(
     seed: int,
     spent: Callable[[], float],
     start: Network | None = None,
-) -> Iterator[tuple[Progress, Network]]:
+) -> Training:
     """Train with PPO under a bound on the share of violating steps; otherwise as `train_ppo`.
 
     Raises:
@@ -118,7 +110,7 @@ def train_sac(
     seed: int,
     spent: Callable[[], float],
     start: Network | None = None,
-) -> Iterator[tuple[Progress, Network]]:
+) -> Training:
     """Train with SAC, on tasks of one vehicle; otherwise as `train_ppo`.
 
     Raises:
@@ -292,7 +284,7 @@ def updates(
     spent: Callable[[], float],
     start: Network | None,
     bound: tuple[Multiplier, Probe] | None = None,
-) -> Iterator[tuple[Progress, Network]]:
+) -> Training:
     """Learn in pieces of some steps of all rows, each checked before it is handed out."""
     steps = options.n_steps if isinstance(options, PpoOptions) else options.progress_steps
     if start is not None:
