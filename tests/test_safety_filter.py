@@ -10,6 +10,7 @@ import quad_envs  # noqa: F401  registers the ids
 from baselines import PolicyError, check_policy, evaluate, make_policy, safe
 from baselines.__main__ import main
 from baselines.policies.registry import policy_options
+from baselines.policies.tracking import ControllerPolicy
 from baselines.sweeps.suite_files import suite_from_dict
 from controllers import SafetyFilter, SafetyOptions
 from quad_envs import formation_v0
@@ -72,16 +73,14 @@ def test_far_from_every_limit_the_command_is_the_policys_own():
 
 def test_where_a_policy_answers_with_nan_the_mpc_flies_and_it_is_counted():
     filtered = safe(Constant(np.nan), CORRIDOR)
-    mpc = SafetyFilter(filtered.task)
+    mpc = ControllerPolicy(SafetyFilter(filtered.task), filtered.task, "the MPC behind the filter")
     env = gymnasium.make(CORRIDOR)
     observation, _ = env.reset(seed=10_000)
     action, state = filtered.predict(observation)
-    seen = filtered._read(observation, None, None)
     assert np.isfinite(action).all()
     assert state.interventions.unanswered.tolist() == [1]
     assert state.interventions.changed.tolist() == [1]
-    none = mpc.filter(*seen.arguments, np.full((1, 4), np.nan))
-    np.testing.assert_array_equal(filtered._answer(seen, none.decision)[0][0], action)
+    np.testing.assert_array_equal(mpc.predict(observation)[0], action)
     violated, _ = fly(filtered, 60)
     assert violated == 0.0
 

@@ -27,8 +27,9 @@ from .decoding import (
 )
 from .estimation import AgentFilters, EstimatorPolicy, SharedEstimatePolicy, make_estimator, shared_estimates
 from .protocol import N_FALLBACKS, Actions, Counts, Estimates, PolicyState
+from .row_policy import Flags
 from .rows import not_finite, times_left
-from .team import Flags, TeamPolicy
+from .team import TeamPolicy
 
 EstimateSource = Literal["own", "shared"]
 

@@ -36,8 +36,9 @@ from .estimation_kernels import (
 from .filtered import Filtered
 from .own_estimator import OwnEstimator
 from .protocol import Actions, Estimates, PolicyState
+from .row_policy import Flags
 from .rows import not_finite
-from .team import Flags, TeamPolicy, plain_state, require_finite
+from .team import TeamPolicy, plain_state, require_finite
 
 DEFAULT_Q = {"estimation": 0.02, "target-tracking": 0.05}  # m^2/s^3
 EstimatorName = Literal["ekf", "trilateration", "polar-ekf", "random-walk"]

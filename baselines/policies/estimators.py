@@ -13,8 +13,8 @@ from quad_envs.tasks import BaseTask, Task, TeamTask
 
 from .disturbance_estimate import DisturbanceEstimator, sees_estimate
 from .protocol import Actions, Estimates
+from .row_policy import Flags
 from .target_estimate import TargetBelief, sees_target_estimate
-from .team import Flags
 
 
 class Extended(NamedTuple):

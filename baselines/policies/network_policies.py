@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from numpy.typing import ArrayLike, NDArray
-
 from quad_envs.tasks import BaseTask
 
 from .estimators import Estimators, asks_for_estimates
 from .network import Network, NetworkPolicy
 from .protocol import Actions, PolicyState
-from .rows import as_rows, as_starts, require_finite, state_of
+from .row_policy import Flags, RowPolicy
+from .rows import require_finite
 
 
-class EstimatingPolicy:
+class EstimatingPolicy(RowPolicy):
     """A network that sees an estimate; what the estimators remember travels in the state.
 
     Args:
@@ -36,30 +33,14 @@ class EstimatingPolicy:
     def __init__(self, network: Network, task: BaseTask, name: str, kind: str = "") -> None:
         self._estimators = Estimators(network.features, task)
         self._network = NetworkPolicy(network, self._estimators.task, name, kind)
-        self.network, self.task, self.name, self.kind = network, self._estimators.given, name, kind
+        super().__init__(self._estimators.given, name, self._estimators.memory_size)
+        self.network, self.kind = network, kind
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.name!r}, {self.task.env_id!r})"
-
-    def predict(
-        self,
-        observation: NDArray[Any],
-        state: PolicyState | None = None,
-        episode_start: ArrayLike | None = None,
-        deterministic: bool = True,
-    ) -> tuple[Actions, PolicyState]:
-        """Choose actions; see `Policy` and `NetworkPolicy.predict`.
-
-        Raises:
-            ValueError: If a shape is wrong or an observation is not finite; it names the part.
-        """
-        obs, one = as_rows(observation, self.task.layout.size)
+    def _decide(self, obs: Actions, state: PolicyState, start: Flags) -> tuple[Actions, PolicyState]:
         require_finite(obs, self.task.layout.slices)
-        start = as_starts(episode_start, len(obs))
-        kept = state_of(state, len(obs), self._estimators.memory_size)
-        seen, memory, targets = self._estimators.extend(obs, kept.memory, start)
+        seen, memory, targets = self._estimators.extend(obs, state.memory, start)
         actions, _ = self._network.predict(seen)
-        return actions[0] if one else actions, kept._replace(memory=memory, estimates=targets)
+        return actions, state._replace(memory=memory, estimates=targets)
 
 
 def network_policy(

@@ -17,8 +17,8 @@ from .decoding import decode_rows, empty_parts, part_starts, split_memory
 from .estimation_kernels import FILTER_SIZE, N_REPORT, STAGE, FilterData, P, X, gather_rows
 from .filtered import Filtered
 from .protocol import Actions
+from .row_policy import Flags
 from .rows import not_finite
-from .team import Flags
 
 _MEMBERS = ("begin", "predict", "update", "mean", "covariance")
 

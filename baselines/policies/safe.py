@@ -18,6 +18,7 @@ from ..errors import PolicyError
 from .blame import place_where_defined
 from .pairing import require_pair
 from .protocol import Actions, Interventions, PolicyState
+from .rows import as_rows, as_starts, state_of
 from .tracking import ControllerPolicy, Seen
 
 
@@ -71,16 +72,17 @@ class SafePolicy(ControllerPolicy):
             ValueError: If a shape is wrong or an observation is not finite; it names the part.
             PolicyError: If the policy behind the filter does not return (actions, state).
         """
-        seen = self._read(observation, state, episode_start)
-        before = None if state is None else state.behind
+        obs, one = as_rows(observation, self._size)
+        start = as_starts(episode_start, len(obs))
+        seen = self._read(obs, state_of(state, len(obs), self.memory_size), start)
         answer = self.unfiltered.predict(
-            seen.obs, before, None if episode_start is None else seen.start, deterministic=deterministic
+            obs, seen.state.behind, None if episode_start is None else start, deterministic=deterministic
         )
-        wanted, behind = self._forces(answer, len(seen.obs))
+        wanted, behind = self._forces(answer, len(obs))
         correction = self.controller.filter(*seen.arguments, wanted)
         actions, kept = self._answer(seen, correction.decision)
         kept = kept._replace(interventions=_counted(seen, correction), behind=behind)
-        return actions[0] if seen.one else actions, kept
+        return actions[0] if one else actions, kept
 
     def _forces(self, answer: Any, n: int) -> tuple[Array, Any]:
         """Commands of what the policy behind the filter answered, (n, 4), N, and its state."""

@@ -17,8 +17,8 @@ from quad_envs.tasks import BaseTask, TeamTask
 
 from .estimation import make_estimator
 from .protocol import Actions, Estimates
+from .row_policy import Flags
 from .shared_filters import Heard, estimate_block
-from .team import Flags
 
 _PART = "estimate["  # how the names of its features begin
 

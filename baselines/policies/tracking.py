@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +17,8 @@ from quad_envs.parameters import Array
 from quad_envs.tasks import Task
 
 from .protocol import N_FALLBACKS, Actions, Counts, PolicyState
-from .rows import as_rows, as_starts, first_not_finite, not_finite, state_of, times_left
+from .row_policy import Flags, RowPolicy
+from .rows import first_not_finite, not_finite, times_left
 
 _PLANT_SIZE, _N_DISTURBANCE = 16, 6
 
@@ -121,16 +122,15 @@ def encode_commands(
 
 
 class Seen(NamedTuple):
-    """What a call of `predict` was given, checked."""
+    """What a policy was given, decoded."""
 
     obs: Actions  # (n, d)
-    one: bool  # whether it was a single observation
     start: NDArray[np.bool_]  # (n,)
     state: PolicyState
     arguments: tuple[Array, Array, Array, Array, Array]  # of `Controller.decide`
 
 
-class ControllerPolicy:
+class ControllerPolicy(RowPolicy):
     """A controller as a policy for tracking observations.
 
     Args:
@@ -139,48 +139,29 @@ class ControllerPolicy:
         name: For tables and messages.
     """
 
+    task: Task
+
     def __init__(self, controller: Controller, task: Task, name: str) -> None:
-        self.controller, self.task, self.name = controller, task, name
-        self._size = task.layout.size
+        super().__init__(task, name, controller.memory_size)
+        self.controller = controller
         self._stages = max(controller.horizon + 1, min(task.layout.preview + 1, TURNING_ROWS))
         self._hover, self._force_max = float(task.hover_force), task.force_max
         self._sees = bool(task.layout.position), bool(task.layout.disturbance)
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.name!r}, {self.task.env_id!r})"
+    def _decide(self, obs: Actions, state: PolicyState, start: Flags) -> tuple[Actions, PolicyState]:
+        seen = self._read(obs, state, start)
+        return self._answer(seen, self.controller.decide(*seen.arguments))
 
-    def predict(
-        self,
-        observation: NDArray[Any],
-        state: PolicyState | None = None,
-        episode_start: ArrayLike | None = None,
-        deterministic: bool = True,
-    ) -> tuple[Actions, PolicyState]:
-        """Choose actions; see `Policy`.
-
-        Raises:
-            ValueError: If a shape is wrong or an observation is not finite; it names the part.
-        """
-        seen = self._read(observation, state, episode_start)
-        decision = self.controller.decide(*seen.arguments)
-        actions, kept = self._answer(seen, decision)
-        return actions[0] if seen.one else actions, kept
-
-    def _read(
-        self, observation: NDArray[Any], state: PolicyState | None, episode_start: ArrayLike | None
-    ) -> Seen:
-        """The arguments of `predict` as those of `Controller.decide`."""
-        obs, one = as_rows(observation, self._size)
+    def _read(self, obs: Actions, state: PolicyState, start: Flags) -> Seen:
+        """The arguments of `Controller.decide`."""
         n = obs.shape[0]
-        start = as_starts(episode_start, n)
-        state = state_of(state, n, self.controller.memory_size)
         plants, lasts = np.empty((n, _PLANT_SIZE)), np.empty((n, 4))
         windows, disturbances = np.empty((n, self._stages, N_REFERENCE)), np.empty((n, _N_DISTURBANCE))
         code = _decode(obs, start, *self._sees, plants, windows, lasts, disturbances)
         if code >= 0:
             raise not_finite(obs, code, self.task.layout.slices)
         memory = state.memory if code == -1 else np.where(start[:, None], 0.0, state.memory)
-        return Seen(obs, one, start, state, (plants, windows, lasts, disturbances, memory))
+        return Seen(obs, start, state, (plants, windows, lasts, disturbances, memory))
 
     def _answer(self, seen: Seen, decision: Decision) -> tuple[Actions, PolicyState]:
         """Actions of a decision, (n, 4), and the state to pass on."""
