@@ -106,14 +106,18 @@ class Judged(NamedTuple):
     seconds: float
 
 
+def problem(seed: int, k: int) -> tuple[str, OcpQp]:
+    """The family of problem k of a seed, and the problem: families in turn, a generator for each problem."""
+    rng = np.random.default_rng([seed, k])
+    family = list(FAMILIES)[k % len(FAMILIES)]
+    return family, FAMILIES[family](rng, base_problem(rng))
+
+
 def judge(number: int, seed: int) -> list[Judged]:
-    """Solve `number` problems, the families in turn, each from a generator of its own."""
+    """Solve the first `number` problems of a seed."""
     solver, found = StructuredSolver(), []
-    names = list(FAMILIES)
     for k in range(number):
-        rng = np.random.default_rng([seed, k])
-        family = names[k % len(names)]
-        qp = FAMILIES[family](rng, base_problem(rng))
+        family, qp = problem(seed, k)
         begin = process_time()
         solution = solver.solve(qp)
         seconds = process_time() - begin

@@ -8,15 +8,20 @@ from ocp_problems import LIMITS, MODELS, hover_qp, random_qp, tilt_rows, velocit
 
 from benchmarks.condensed import solve_daqp
 from controllers.qp import Status, StructuredSolver, residuals
+from controllers.qp.active_set import Face
+from controllers.qp.inverse_factor import inverse_factor
 from controllers.qp.ocp import (
     StateRows,
     concatenate_rows,
     condense,
+    first_move_bounds,
     output_rows,
     rate_weight,
 )
 from controllers.qp.recursion import Feedback
-from controllers.qp.structured import inverse_factor, solve_structured
+from controllers.qp.rows import RowData, row_spans
+from controllers.qp.structured import ITERATION_LIMIT, solve_by_dear_inputs, solve_structured
+from controllers.qp.working_set import correct
 from controllers.qp.workspace import make_workspace
 from quad_envs.compilation.packed import pack
 
@@ -250,3 +255,39 @@ def test_a_pickled_solver_solves_alike():
     copy = pickle.loads(pickle.dumps(solver))
     assert copy.iteration_limit == 77
     np.testing.assert_array_equal(copy.solve(qp).u, expected.u)
+
+
+def rows_of(qp, ws):
+    """All rows of a problem as the kernels of the active set take them."""
+    row_spans(qp.rows.normals, ws.spans)
+    first_move = np.array(first_move_bounds(qp))
+    return RowData(qp.lower, qp.upper, qp.rate_step, first_move, *qp.rows, ws.spans)
+
+
+def test_refinement_puts_held_inputs_at_the_very_value_of_their_bound():
+    qp = hover_qp(25, FAR, upper=0.49, rate_step=0.25)
+    ws = make_workspace(25, 0, 1)
+    solve_structured(*qp[:-2], *qp.rows, rate_weight(qp), ITERATION_LIMIT, False, pack(ws))
+    exact, held = ws.u.copy(), ws.state[:100].reshape(25, 4) + ws.state[100:200].reshape(25, 4)
+    assert held.sum() > 10
+    ws.u[:] += 0.1 * np.random.default_rng(12).normal(size=ws.u.shape)
+    face = Face(ws.u, ws.x, *ws.factors, ws.active, ws.state, ws.vectors)
+    correct(rows_of(qp, ws), np.zeros(100), face, int((ws.state == 1).sum()))
+    assert np.isin(ws.u[held == 1], (-1.96, 0.49)).all()
+    assert np.abs(ws.u - exact)[held == 0].max() > 1e-3  # the gradient that would show the rest was left out
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("limits", LIMITS)
+def test_dear_inputs_lead_to_the_same_optimum(model, limits):
+    rng = np.random.default_rng([16, MODELS.index(model), LIMITS.index(limits)])
+    for N in (1, 5, 15):
+        qp = random_qp(rng, N, model, limits)
+        expected = SOLVER.solve(qp)
+        ws = make_workspace(N, len(qp.rows.normal), len(qp.A))
+        packed = qp._replace(R_rate=rate_weight(qp))
+        status, _ = solve_by_dear_inputs(packed, rows_of(qp, ws), 0, 100_000, ws)
+        assert status == expected.status
+        if status == Status.OPTIMAL:
+            # Both are exact: what differs is round-off over some hundred steps.
+            np.testing.assert_allclose(ws.u, expected.u, atol=1e-9 * (1.0 + np.abs(ws.u).max()))

@@ -55,7 +55,7 @@ def row_spans(normals: Array, spans: IntArray) -> None:
 
 
 @kernel
-def _worst_input_row(u: Array, rows: RowData, state: ByteArray) -> tuple[int, float]:
+def worst_input_row(u: Array, rows: RowData, state: ByteArray) -> tuple[int, float]:
     """The inactive box or rate row with the most negative slack; (-1, -tolerance) if there is none."""
     N, m = u.shape
     nv = N * m
@@ -111,7 +111,7 @@ def _worst_state_row(
 @kernel
 def worst_row(u: Array, x: Array, rows: RowData, state: ByteArray) -> tuple[int, float]:
     """The row to work on next and its slack, or -1 if the plan (u, x) is optimal."""
-    row, slack = _worst_input_row(u, rows, state)
+    row, slack = worst_input_row(u, rows, state)
     if rows.normal.shape[0] == 0:
         return row, slack
     return _worst_state_row(x, rows, 4 * u.size, state, row, slack)

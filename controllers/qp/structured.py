@@ -5,8 +5,9 @@
    condensed Hessian: J is the impulse response from whitened inputs to inputs, so neither H nor its Cholesky
    factor is ever formed. The dual active set (`active_set.py`) starts from there, or from a guess of the
    working set (`working_set.py`).
-3. The gradient of the Lagrangian is evaluated, refined once if need be, and only a small one is called
-   optimal (`stationarity.py`).
+3. The gradient of the Lagrangian is evaluated, the plan refined if need be, and only what is stationary and
+   within its rows is called optimal (`stationarity.py`).
+4. Where that takes very many steps, inputs are made dear at first, and cheaper from one solve to the next.
 """
 
 from __future__ import annotations
@@ -33,12 +34,13 @@ from .active_set import (
     project,
     roll_out,
 )
-from .linalg import fill
+from .active_set import ITERATION_LIMIT as OUT_OF_STEPS
+from .inverse_factor import inverse_factor
 from .ocp import IntArray, OcpQp, StateRows, rate_weight, validate, weight_of_changes
-from .products import add_product, negate, transpose
+from .products import transpose
 from .rate_weight import carve_rate, rate_pass, rate_plan
 from .recursion import Feedback, Regulator, optimal_plan, riccati_pass
-from .rows import ROW_TOLERANCE, ByteArray, RowData, row_slack, row_spans, worst_row
+from .rows import ROW_TOLERANCE, ByteArray, RowData, row_slack, row_spans, worst_input_row, worst_row
 from .solution import Multipliers, Solution, Status
 from .stationarity import REFINED, STATIONARY, is_mild, lagrangian_gradient
 from .working_set import correct, start_from_guess
@@ -46,98 +48,14 @@ from .workspace import Workspace, make_workspace
 
 ITERATION_LIMIT = 0  # stands for a limit that grows with the problem, `step_limit`
 _STEPS, _STEPS_PER_ROW = 2000, 20  # random problems with horizons up to 60 stay below
-_ROW_ERROR = 1e-7  # largest violation of a row that a refined solution may have, as `STATIONARY`
-
-
-@kernel
-def _start_column(B: Array, D: Array, J_T: Array, w: int, response: Array, column: int) -> None:
-    """The diagonal block D of J at column w, and the response B D of the next state at the given column."""
-    n, m = B.shape
-    for b in range(m):
-        for a in range(m):
-            J_T[w + b, w + a] = D[a, b]
-        for a in range(n):
-            total = 0.0
-            for k in range(b + 1):  # D is upper triangular
-                total += B[a, k] * D[k, b]
-            response[a, column + b] = total
-
-
-@kernel
-def _march(K: Array, A_cl: Array, X: Array, width: int, J_T: Array, w: int, X_next: Array) -> None:
-    """One stage: rows w.. of J, -K X, below the first columns, and X_next = A_cl X, over `width` columns."""
-    row = X_next[0]  # scratch until X_next is made
-    for a in range(K.shape[0]):
-        for k in range(width):
-            row[k] = 0.0
-        for b in range(K.shape[1]):
-            factor = K[a, b]
-            for k in range(width):
-                row[k] -= factor * X[b, k]
-        for k in range(width):
-            J_T[k, w + a] = row[k]
-    for a in range(A_cl.shape[0]):
-        for k in range(width):
-            X_next[a, k] = 0.0
-        for b in range(A_cl.shape[1]):
-            factor = A_cl[a, b]
-            for k in range(width):
-                X_next[a, k] += factor * X[b, k]
-
-
-@kernel
-def _close_loop(A: Array, B_T: Array, K: Array, minus: Array, A_cl: Array) -> None:
-    """A_cl = A - B K, with B' as `riccati_pass` leaves it."""
-    negate(K, minus)
-    add_product(A, B_T, minus, A_cl)
-
-
-@kernel
-def inverse_factor(
-    A: Array,
-    B: Array,
-    stationary: bool,
-    feedback: Feedback,
-    K_u: Array,
-    J_T: Array,
-    wide: Array,
-    scratch: Array,
-) -> None:
-    """J with J J' = H^-1: J_jj = D_j, J_ij = -K_i A_cl_{i-1} .. A_cl_{j+1} B_j D_j below, 0 above.
-
-    Marches the response X_i of x_i to all whitened inputs before stage i: rows i of J left of the diagonal
-    are -K_i X_i, and X_{i+1} = [A_cl_i X_i, B_i D_i] with A_cl = A - B K. With one gain J is block Toeplitz:
-    the first block column is marched and the others are copies.
-
-    Args:
-        A: (1 or N, n, n).
-        B: (1 or N, n, 4).
-        stationary: Whether the first gain serves all stages.
-        feedback: Of `riccati_pass`.
-        K_u: Gains of u, (N, 4, n): those of the feedback, but where changes of u have a weight.
-        J_T: Result, J by columns, (4N, 4N).
-        wide: Overwritten, (2, n, 4N).
-        scratch: Overwritten, (2, n, n).
-    """
-    K, D, A_cl = feedback.K, feedback.D, scratch[0]
-    N, m = D.shape[:2]
-    n, nv = A.shape[1], m * N
-    fill(J_T, 0.0)
-    for i in range(N):
-        X, X_next = wide[i % 2], wide[1 - i % 2]
-        g = 0 if stationary else i
-        j = i if B.shape[0] > 1 else 0
-        if i == 1 or (i > 1 and not stationary):
-            _close_loop(A[j], feedback.transposed[j, n:], K[g], scratch[1], A_cl)
-        if i > 0:
-            _march(K_u[g], A_cl, X, m if stationary else m * i, J_T, m * i, X_next)
-        if i == 0 or not stationary:
-            _start_column(B[j], D[g], J_T, m * i, X_next, m * i)
-    if stationary:
-        for k in range(m, nv):
-            start = k - k % m
-            for j in range(nv - start):
-                J_T[k, start + j] = J_T[k % m, j]
+_ROW_ERROR = 1e-7  # largest violation of a state row that a refined solution may have, as `STATIONARY`
+_REFINEMENTS = 3  # of the plan on one face
+_ROUNDS = 3  # of active set and refinement, after which no command may be outside its rows
+_DIRECT = 4  # one step in so many comes before inputs are made dear
+_LEVELS, _LEVEL = (
+    7,
+    100.0,
+)  # weights of dear inputs: R times 1e12 at first, each a hundredth of the one before
 
 
 @kernel
@@ -233,15 +151,22 @@ def _clear(values: Array | ByteArray, n: int) -> None:
 
 
 @kernel
-def _largest_gap(rows: RowData, q: int, ws: Workspace) -> float:
-    """How far a working row is from equality, over 1 + the largest input; in states summed anew."""
-    largest, gap = 1.0, 0.0
+def _gaps(rows: RowData, q: int, ws: Workspace) -> tuple[float, float]:
+    """How far working rows are from equality: those of inputs; those of states, over 1 + the largest input.
+
+    States are those that were summed anew.
+    """
+    largest, of_inputs, of_states = 1.0, 0.0, 0.0
     for k in range(ws.u.shape[0]):
         for a in range(N_INPUT):
             largest = max(largest, 1.0 + abs(ws.u[k, a]))
     for i in range(q):
-        gap = max(gap, abs(row_slack(ws.active[i], ws.u, ws.states, rows)))
-    return gap / largest
+        gap = abs(row_slack(ws.active[i], ws.u, ws.states, rows))
+        if ws.active[i] < 4 * ws.u.size:
+            of_inputs = max(of_inputs, gap)
+        else:
+            of_states = max(of_states, gap)
+    return of_inputs, of_states / largest
 
 
 @kernel
@@ -256,36 +181,56 @@ def _face(ws: Workspace) -> Face:
 
 
 @kernel
-def _finish(qp: OcpQp, rows: RowData, q: int, ws: Workspace) -> int:
-    """Multipliers, and OPTIMAL or INACCURATE for the face reached: refined once if it is not stationary."""
-    u, x, face = ws.u, ws.x, _face(ws)
-    relative, gap = math.inf, math.inf
-    for attempt in range(2):
-        if attempt == 1:
+def _largest_step(q: int, ws: Workspace) -> float:
+    """How far another refinement on the face would move an input."""
+    d, z = ws.vectors[0], ws.vectors[1]
+    project(ws.factors[0], ws.gradient, 0, ws.u.size, d)
+    primal_direction(ws.factors[0], d, q, z)
+    largest = 0.0
+    for k in range(ws.u.size):
+        largest = max(largest, abs(z[k]))
+    return largest
+
+
+@kernel
+def _finish(qp: OcpQp, rows: RowData, q: int, stationary: float, ws: Workspace) -> int:
+    """Multipliers, and OPTIMAL or INACCURATE for the face reached: refined where it is not stationary.
+
+    Refinement on the face may carry an input over a row that is not working.
+    """
+    face, before = _face(ws), math.inf
+    for attempt in range(1 + _REFINEMENTS):
+        if attempt > 0:
             correct(rows, ws.gradient, face, q)
-            roll_out(_dynamics(qp, ws), u, x)
+            roll_out(_dynamics(qp, ws), ws.u, ws.x)
         collect_multipliers(face, rows.weight, q, ws.multipliers)
         relative = _stationarity(qp, rows, ws)
-        gap = _largest_gap(rows, q, ws)
-        if attempt == 0 and relative <= REFINED and gap <= ROW_TOLERANCE:
+        of_inputs, of_states = _gaps(rows, q, ws)
+        if attempt == 0:
+            if relative <= REFINED and max(of_inputs, of_states) <= ROW_TOLERANCE:
+                return OPTIMAL
+            continue
+        _, slack = worst_row(ws.u, ws.x, rows, ws.state)
+        ws.error[0], ws.error[1] = _largest_step(q, ws), max(of_inputs, max(of_states, -slack))
+        if relative <= stationary and of_inputs <= ROW_TOLERANCE and ws.error[1] <= _ROW_ERROR:
             return OPTIMAL
-    _, slack = worst_row(u, x, rows, ws.state)
-    project(ws.factors[0], ws.gradient, 0, u.size, ws.vectors[0])
-    primal_direction(ws.factors[0], ws.vectors[0], q, ws.vectors[1])
-    ws.error[0], ws.error[1] = 0.0, max(gap, -slack)
-    for k in range(u.size):
-        ws.error[0] = max(ws.error[0], abs(ws.vectors[1, k]))
-    return OPTIMAL if relative <= STATIONARY and ws.error[1] <= _ROW_ERROR else INACCURATE
+        if not relative < 0.5 * before:
+            break
+        before = relative
+    return INACCURATE
 
 
 @kernel
 def _solve_rows(
-    qp: OcpQp, rows: RowData, warm: bool, iterations: int, iteration_limit: int, ws: Workspace
+    qp: OcpQp, rows: RowData, own: bool, warm: bool, iterations: int, iteration_limit: int, ws: Workspace
 ) -> tuple[int, int]:
-    """From the unconstrained optimum in ws to the constrained one; with `warm` by way of ws.guess."""
+    """From the unconstrained optimum in ws, after `_factor`, to the constrained one; `warm`: by ws.guess.
+
+    If both are not qp's `own`, but of other weights, the plan on the face that they lead to is refined to be
+    qp's. From there the active set cannot go on.
+    """
     model, face = _dynamics(qp, ws), _face(ws)
     n_rows = 4 * ws.u.size + 2 * rows.normal.shape[0]
-    _factor(qp, ws)
     q = 0
     ws.error[0] = math.inf
     _clear(ws.state, n_rows)
@@ -293,14 +238,67 @@ def _solve_rows(
         q, changes = start_from_guess(model, rows, ws.guess[:n_rows], face, ws.force)
         iterations += changes
     row, slack = worst_row(ws.u, ws.x, rows, ws.state)
-    status, iterations, q = dual_active_set(model, rows, face, row, slack, q, iterations, iteration_limit)
-    if not (_all_finite(ws.u) and _all_finite(ws.x)):
-        return NOT_FINITE, iterations
-    finished = _finish(qp, rows, q, ws)
+    status, finished = OPTIMAL, OPTIMAL
+    for _ in range(_ROUNDS if own else 1):
+        status, iterations, q = dual_active_set(model, rows, face, row, slack, q, iterations, iteration_limit)
+        if not (_all_finite(ws.u) and _all_finite(ws.x)):
+            return NOT_FINITE, iterations
+        finished = _finish(qp, rows, q, STATIONARY if own else REFINED, ws)
+        row, slack = worst_input_row(ws.u, rows, ws.state)
+        if status != OPTIMAL or row < 0:
+            break
     if status != OPTIMAL:
         ws.error[0] = math.inf
         return status, iterations
-    return finished, iterations
+    return (finished if row < 0 else INACCURATE), iterations
+
+
+@kernel
+def _with_dear_inputs(qp: OcpQp, factor: float, ws: Workspace) -> OcpQp:
+    """The problem with `factor` times the weight of its inputs."""
+    R = ws.dear[: qp.R.shape[0]]
+    for i in range(R.shape[0]):
+        for a in range(N_INPUT):
+            for b in range(N_INPUT):
+                R[i, a, b] = factor * qp.R[i, a, b]
+    return OcpQp(
+        qp.A, qp.B, qp.c, qp.Q, R, qp.Q_f, False, qp.x_0, qp.r, qp.lower, qp.upper, qp.rate_step, qp.u_last,
+        qp.rows, qp.R_rate,
+    )  # fmt: skip
+
+
+@kernel
+def solve_by_dear_inputs(
+    qp: OcpQp, rows: RowData, iterations: int, iteration_limit: int, ws: Workspace
+) -> tuple[int, int]:
+    """By way of problems whose inputs are dearer, each from the working set of the one before.
+
+    Dear inputs keep the unconstrained plan near its rows, and from one weight to the next few rows change.
+    The face of each is tried for the problem itself, whose own matrices may be too ill-conditioned for that.
+    """
+    n_rows = 4 * ws.u.size + 2 * rows.normal.shape[0]
+    status = INACCURATE
+    for level in range(_LEVELS - 1, -1, -1):
+        dear = _with_dear_inputs(qp, _LEVEL**level, ws)
+        _recursion(dear, ws)
+        _plan(dear, ws)
+        if not (_all_finite(ws.u) and _all_finite(ws.x)):
+            return NOT_FINITE, iterations
+        _factor(dear, ws)
+        warm = level < _LEVELS - 1
+        status, iterations = _solve_rows(qp, rows, level == 0, warm, iterations, iteration_limit, ws)
+        infeasible = status == INFEASIBLE and _has_hard_rows(rows)
+        if infeasible or not (status == INACCURATE or status == INFEASIBLE):
+            break
+        _keep_as_guess(n_rows, ws)
+    return status, iterations
+
+
+@kernel
+def _keep_as_guess(n_rows: int, ws: Workspace) -> None:
+    """The next warm start begins from the states that rows have now."""
+    for k in range(n_rows):
+        ws.guess[k] = ws.state[k]
 
 
 @kernel
@@ -328,13 +326,27 @@ def _is_optimal(qp: OcpQp, rows: RowData, ws: Workspace) -> bool:
     return bool(_stationarity(qp, rows, ws) <= STATIONARY)
 
 
+@kernel
+def _require_fit(qp: OcpQp, ws: Workspace) -> None:
+    if (
+        ws.u.shape[0] != qp.c.shape[0]
+        or ws.spans.shape[0] < max(qp.rows.normal.shape[0], qp.rows.normals.shape[0])
+        or ws.transposed.shape[0] < qp.A.shape[0]
+        or (ws.rate.size == 0 and weight_of_changes(qp).shape[0] > 0)
+    ):
+        raise ValueError(
+            "the workspace does not fit the problem: make it with its horizon, rows, pairs and weights"
+        )
+
+
 @separate_kernel
 def solve_qp(qp: OcpQp, iteration_limit: int, warm: bool, ws: Workspace) -> tuple[int, int]:
     """Solve one OCP-QP, whose R_rate is an array: (0, 4) where changes have no weight.
 
     Nothing is allocated and nothing is validated. Compiled loops may call it, with one workspace per thread.
     A warm start that ends without an optimum is done again cold, and a cold one that accuracy let down once
-    more from the working set that it reached.
+    more from the working set that it reached. Where no limit is asked for, a quarter of the steps goes into
+    that; the others are for the way by dear inputs.
 
     Args:
         qp: The problem; `stationary` is not read where changes have a weight.
@@ -347,16 +359,8 @@ def solve_qp(qp: OcpQp, iteration_limit: int, warm: bool, ws: Workspace) -> tupl
         Status as an integer, and the number of active-set steps: changes of the unconstrained plan's or the
         guessed working set, 0 if the Riccati plan satisfies every row.
     """
+    _require_fit(qp, ws)
     N, K = qp.c.shape[0], qp.rows.normal.shape[0]
-    if (
-        ws.u.shape[0] != N
-        or ws.spans.shape[0] < max(K, qp.rows.normals.shape[0])
-        or ws.transposed.shape[0] < qp.A.shape[0]
-        or (ws.rate.size == 0 and weight_of_changes(qp).shape[0] > 0)
-    ):
-        raise ValueError(
-            "the workspace does not fit the problem: make it with its horizon, rows, pairs and weights"
-        )
     n_rows = 4 * N_INPUT * N + 2 * K
     _clear(ws.multipliers, n_rows)
     _clear(ws.state, n_rows)
@@ -365,6 +369,7 @@ def solve_qp(qp: OcpQp, iteration_limit: int, warm: bool, ws: Workspace) -> tupl
     last = qp.u_last[0] + qp.u_last[1] + qp.u_last[2] + qp.u_last[3]
     finite = abs(last) < math.inf and _all_finite(qp.r)
     limit = step_limit(iteration_limit, N, K)
+    direct = limit if iteration_limit > 0 else limit // _DIRECT
     status, iterations = NOT_FINITE, 0
     for attempt in range(3):
         _plan(qp, ws)
@@ -373,17 +378,19 @@ def solve_qp(qp: OcpQp, iteration_limit: int, warm: bool, ws: Workspace) -> tupl
         if attempt == 0 and _is_optimal(qp, rows, ws):
             return OPTIMAL, 0
         # A warm start gets half of the steps, so that a cold one is left.
-        steps = (iterations + limit + 1) // 2 if warm and attempt == 0 else limit
-        status, iterations = _solve_rows(qp, rows, warm, iterations, steps, ws)
-        if status == OPTIMAL or iterations >= limit:
+        steps = (iterations + direct + 1) // 2 if warm and attempt == 0 else direct
+        _factor(qp, ws)
+        status, iterations = _solve_rows(qp, rows, True, warm, iterations, steps, ws)
+        if status == OPTIMAL or iterations >= direct:
             break
         hard = status == INFEASIBLE and _has_hard_rows(rows)
         if hard or (attempt > 0 and warm):
             break
         warm = not (warm and attempt == 0)
         if warm:
-            for k in range(n_rows):
-                ws.guess[k] = ws.state[k]
+            _keep_as_guess(n_rows, ws)
+    if status == OUT_OF_STEPS and iterations < limit:
+        status, iterations = solve_by_dear_inputs(qp, rows, iterations, limit, ws)
     if status == INFEASIBLE and not _has_hard_rows(rows):
         status = INACCURATE  # box, rate and soft rows cannot contradict each other
     return status, iterations
@@ -428,7 +435,8 @@ class StructuredSolver:
     """Backend over `solve_structured`: validates, keeps a workspace, copies the result out.
 
     Args:
-        iteration_limit: Largest number of active-set steps per problem; 0 for one that grows with it.
+        iteration_limit: Largest number of active-set steps per problem; 0 for one that grows with it, three
+            quarters of which are for the way by dear inputs.
     """
 
     def __init__(self, iteration_limit: int = ITERATION_LIMIT) -> None:

@@ -264,11 +264,23 @@ def _add_columns(J_T: Array, factors: Array, count: int, z: Array) -> None:
 
 
 @kernel
+def _put_on_bounds(rows: RowData, face: Face, q: int) -> None:
+    """Inputs that are held at a bound of the box get its very value."""
+    nv = face.u.size
+    for i in range(q):
+        p = face.active[i]
+        if p < 2 * nv:
+            k, a = (p % nv) // N_INPUT, p % N_INPUT
+            face.u[k, a] = rows.lower[a] if p < nv else rows.upper[a]
+
+
+@kernel
 def correct(rows: RowData, gradient: Array, face: Face, q: int) -> None:
     """One step of iterative refinement on the face: inputs and multipliers against what is left of both.
 
     With g the gradient of the Lagrangian, d = J'g and gaps s of the working rows: `y = R^-T s`,
-    `u += J_1 y - J_2 d_2`, `nu += R^-1 (d_1 + y)`, kept in [0, weight].
+    `u += J_1 y - J_2 d_2`, `nu += R^-1 (d_1 + y)`, kept in [0, weight]. Inputs at a bound
+    of the box are then put there exactly; what that does to other rows is for the caller to see.
 
     Args:
         rows: The rows of the problem.
@@ -287,6 +299,7 @@ def correct(rows: RowData, gradient: Array, face: Face, q: int) -> None:
     solve_triangle_transposed(R_T, gap, q, y)
     _add_columns(J_T, y, q, z)
     move_along(u, z, 1.0)
+    _put_on_bounds(rows, face, q)
     for i in range(q):
         y[i] += d[i]
     solve_triangle(R_T, y, q, r)

@@ -38,6 +38,7 @@ class Workspace(NamedTuple):
     state: Annotated[ByteArray, "16N + 2K"]  # of every row at the end
     guess: Annotated[ByteArray, "16N + 2K"]  # of every row, to start from
     error: Annotated[Array, "2"]  # left after refinement: how far another would move an input; gaps of rows
+    dear: Annotated[Array, "N, 4, 4"]  # another weight of the inputs
     rate: Annotated[Array, "numbers"]  # of a weight on changes, see `carve_rate`; may be empty
 
 
@@ -81,5 +82,6 @@ def make_workspace(horizon: int, n_rows: int, n_models: int, weighs_changes: boo
         state=np.zeros(4 * nv + 2 * n_rows, dtype=np.int8),
         guess=np.zeros(4 * nv + 2 * n_rows, dtype=np.int8),
         error=np.zeros(2),
+        dear=np.zeros((N, m, m)),
         rate=np.zeros(rate_size(N, n_models) if weighs_changes else 0),
     )
