@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TypeVar, get_args, get_type_hints
+from typing import Annotated, Any, NoReturn, TypeAlias, TypeVar, get_args, get_type_hints
 
 from .values import read_value
 
@@ -31,12 +31,22 @@ class Positional(str):
     """Help text of an argument without a flag; the help text of a flag is a plain string."""
 
 
+# What several commands take.
+EnvArguments: TypeAlias = Annotated[
+    list[str], "keyword argument of the environment; JSON, {key: value}, or text"
+]
+PolicyOptions: TypeAlias = Annotated[list[str], "option of the policy; JSON, {key: value}, or text"]
+Json: TypeAlias = Annotated[bool, "print JSON"]
+SaveEpisodes: TypeAlias = Annotated[bool, "save every flight, not only the first two of the report"]
+ResultsFolder: TypeAlias = Annotated[Path, Positional("results folder of evaluate or benchmark")]
+
+
 @dataclass(frozen=True, slots=True)
 class ListOptions:
     """What there is: environments, policies, suites."""
 
     name: Annotated[str, Positional("environment, policy or training algorithm, to see its options")] = ""
-    json: Annotated[bool, "print JSON"] = False
+    json: Json = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,16 +63,12 @@ class EvaluateOptions:
     ]
     episodes: Annotated[int, "number of flights"] = 20
     seed: Annotated[int, "environment seed of the first flight"] = 0
-    set: Annotated[list[str], "keyword argument of the environment; JSON, {key: value}, or text"] = field(
-        default_factory=list
-    )
-    policy_set: Annotated[list[str], "option of the policy; JSON, {key: value}, or text"] = field(
-        default_factory=list
-    )
-    json: Annotated[bool, "print JSON"] = False
+    set: EnvArguments = field(default_factory=list)
+    policy_set: PolicyOptions = field(default_factory=list)
+    json: Json = False
     out: Annotated[Path | None, "results folder"] = None
     fresh: Annotated[bool, "discard what the results folder holds of an earlier run"] = False
-    save_episodes: Annotated[bool, "save every flight, not only the first two of the report"] = False
+    save_episodes: SaveEpisodes = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +95,8 @@ class BenchmarkOptions:
         "part of the suite: tracking, teams, an environment, a condition or a table; several if repeated",
     ] = field(default_factory=list)
     quick: Annotated[bool, "a small part of the suite, to see it work"] = False
-    json: Annotated[bool, "print JSON"] = False
-    save_episodes: Annotated[bool, "save every flight, not only the first two of the report"] = False
+    json: Json = False
+    save_episodes: SaveEpisodes = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,16 +109,14 @@ class TrainOptions:
     seconds: Annotated[float | None, "budget in CPU-seconds; the algorithm's own if not given"] = None
     steps: Annotated[int | None, "budget in environment steps instead"] = None
     out: Annotated[Path | None, "folder; runs/ALGORITHM-TASK-SEED if not given"] = None
-    set: Annotated[list[str], "keyword argument of the environment; JSON, {key: value}, or text"] = field(
-        default_factory=list
-    )
+    set: EnvArguments = field(default_factory=list)
     hyper: Annotated[list[str], "hyperparameter, as in quad-envs list ALGORITHM; JSON, or text"] = field(
         default_factory=list
     )
     from_: Annotated[str, "begin with the network of a checkpoint: its folder, or a shipped policy"] = ""
     resume: Annotated[bool, "go on with the run in the folder: its weights, counters and curve"] = False
     fresh: Annotated[bool, "discard the run that is in the folder"] = False
-    json: Annotated[bool, "print JSON"] = False
+    json: Json = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,15 +133,11 @@ class TuneOptions:
         default_factory=list
     )
     out: Annotated[Path | None, "folder; runs/tuned-POLICY-TASK-SEED if not given"] = None
-    set: Annotated[list[str], "keyword argument of the environment; JSON, {key: value}, or text"] = field(
-        default_factory=list
-    )
-    policy_set: Annotated[list[str], "option of the policy; JSON, {key: value}, or text"] = field(
-        default_factory=list
-    )
+    set: EnvArguments = field(default_factory=list)
+    policy_set: PolicyOptions = field(default_factory=list)
     resume: Annotated[bool, "go on with the search in the folder"] = False
     fresh: Annotated[bool, "discard the search that is in the folder"] = False
-    json: Annotated[bool, "print JSON"] = False
+    json: Json = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,13 +156,9 @@ class RecordOptions:
         list[str],
         "standard deviation of noise on actions in -1 to 1; repeated, one for each policy",
     ] = field(default_factory=list)
-    set: Annotated[list[str], "keyword argument of the environment; JSON, {key: value}, or text"] = field(
-        default_factory=list
-    )
-    policy_set: Annotated[list[str], "option of the policy; JSON, {key: value}, or text"] = field(
-        default_factory=list
-    )
-    json: Annotated[bool, "print JSON"] = False
+    set: EnvArguments = field(default_factory=list)
+    policy_set: PolicyOptions = field(default_factory=list)
+    json: Json = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,9 +171,7 @@ class ExportOptions:
     folder: Annotated[Path, Positional("of the checkpoint")]
     vecnormalize: Annotated[Path | None, "file of VecNormalize.save, if it was trained with it"] = None
     env: Annotated[str, "environment it was trained in, so that what it sees is known by name"] = ""
-    set: Annotated[list[str], "keyword argument of the environment; JSON, {key: value}, or text"] = field(
-        default_factory=list
-    )
+    set: EnvArguments = field(default_factory=list)
     fresh: Annotated[bool, "replace the checkpoint that is in the folder"] = False
 
 
@@ -189,7 +183,7 @@ class ReproduceOptions:
         default_factory=list
     )
     jobs: Annotated[int, "processes"] = 1
-    json: Annotated[bool, "print JSON"] = False
+    json: Json = False
     out: Annotated[Path | None, "folder; sections that are there are read, and not flown again"] = None
     fresh: Annotated[bool, "discard the sections that the folder holds"] = False
 
@@ -198,7 +192,7 @@ class ReproduceOptions:
 class ReportOptions:
     """Make the page of a results folder again: leaderboard and flights in one file."""
 
-    run: Annotated[Path, Positional("results folder of evaluate or benchmark")]
+    run: ResultsFolder
     out: Annotated[Path | None, "file of the page; RUN/report.html if not given"] = None
 
 
@@ -206,7 +200,7 @@ class ReportOptions:
 class ReplayOptions:
     """Open one flight of a results folder in the browser."""
 
-    run: Annotated[Path, Positional("results folder of evaluate or benchmark")]
+    run: ResultsFolder
     env: Annotated[str, "environment, its id or its label in the suite; the first if not given"] = ""
     policy: Annotated[str, "policy that is shown; the best and the base if not given"] = ""
     seed: Annotated[int | None, "environment seed of the flight; the first saved one if not given"] = None
@@ -221,13 +215,9 @@ class CertifyOptions:
     policy: Annotated[str, Positional("lmpc, sdc-nmpc, sdre, lqr or nmpc")]
     seed: Annotated[int, "of the flight and of the random starts"] = 0
     starts: Annotated[int, "random starts in each invariant ellipsoid"] = 100
-    set: Annotated[list[str], "keyword argument of the environment; JSON, {key: value}, or text"] = field(
-        default_factory=list
-    )
-    policy_set: Annotated[list[str], "option of the policy; JSON, {key: value}, or text"] = field(
-        default_factory=list
-    )
-    json: Annotated[bool, "print JSON"] = False
+    set: EnvArguments = field(default_factory=list)
+    policy_set: PolicyOptions = field(default_factory=list)
+    json: Json = False
     out: Annotated[Path | None, "folder for certify.json and the figures"] = None
 
 
@@ -252,7 +242,7 @@ class WarmOptions:
 class DoctorOptions:
     """Look at the installation and fly a moment."""
 
-    json: Annotated[bool, "print JSON"] = False
+    json: Json = False
 
 
 class Parser(argparse.ArgumentParser):
