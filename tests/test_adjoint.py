@@ -9,7 +9,7 @@ from baselines.training.flights import DifferentiableFlights
 from quad_envs.dynamics import simulate
 from quad_envs.envs.shared.adjoint import SCRATCH_ROWS, step_vjp
 from quad_envs.envs.shared.task_vector import task_vector
-from quad_envs.envs.tracking.adjoint import action_slopes, reward_vjp, tracking_vjp_rows
+from quad_envs.envs.tracking.adjoint import TrackingRecord, action_slopes, reward_vjp, tracking_vjp_rows
 from quad_envs.lanes import COMMAND
 from quad_envs.parameters import QuadrotorParams
 from quad_envs.references import Heading, make_reference
@@ -77,7 +77,7 @@ def test_a_vehicle_in_gusts_is_taken_back_as_it_flew():
     flights = DifferentiableFlights(env.unwrapped.options, 6, 0)
     rng = np.random.default_rng(0)
     for _ in range(20):
-        record = flights.advance((0.1 * rng.normal(size=(6, 4))).astype(np.float32))
+        record = flights.advance((0.1 * rng.normal(size=(6, 4))).astype(np.float32)).record
         flown = control_period(record.plants, record.commands, flights.task, 2, record.disturbances)[-1]
         assert np.allclose(flown, record.after, atol=1e-9)
     assert np.abs(record.disturbances).max() > 0.05
@@ -158,11 +158,12 @@ def test_the_adjoint_of_a_step_with_its_reward_is_the_derivative_of_both():
         return (after * bars).sum(axis=1) + bar_rewards * np.array(rewards)
 
     found = np.zeros((20, 16)), np.zeros((20, 4)), np.zeros((20, 4))
-    tracking_vjp_rows(
+    record = TrackingRecord(
         plants, commands, previous, simulate(plants, commands, params, force_max=force_max), references,
         np.zeros(20, dtype=np.bool_), np.tile(force_max, (20, 1)), np.tile(params.coefficients(), (20, 1)),
-        np.zeros((20, 11, 6)), task, bars, bar_rewards, 0.0, *found, np.zeros((SCRATCH_ROWS + 4, 16)),
+        np.zeros((20, 11, 6)),
     )  # fmt: skip
+    tracking_vjp_rows(record, task, bars, bar_rewards, 0.0, *found, np.zeros((SCRATCH_ROWS + 4, 16)))
     assert np.allclose(found[0], differences(lambda x: value(x, commands, previous), plants), atol=1e-6)
     assert np.allclose(found[1], differences(lambda u: value(plants, u, previous), commands), atol=1e-6)
     assert np.allclose(found[2], differences(lambda p: value(plants, commands, p), previous), atol=1e-6)

@@ -90,7 +90,7 @@ def test_what_the_gradient_neglects_of_a_disturbance_is_its_share_of_the_weight(
 def test_disturbances_and_noise_are_flown_in_training():
     calm, blown, noisy = (begin(one) for one in ({}, FORCE, {"sensor_noise": 0.01}))
     still = np.zeros((FLIGHTS, 4), dtype=np.float32)
-    after = [flights.advance(still).after for flights in (calm, blown)]
+    after = [flights.advance(still).record.after for flights in (calm, blown)]
     push = 0.05 * 0.4 / calm.task.params.mass  # of one control period, where the vehicle is level
     assert np.median(after[1][:, 3] - after[0][:, 3]) == pytest.approx(push, rel=0.1)
     assert np.abs(noisy.observe() - calm.observe()).max() > 1e-3

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from quad_envs.arguments.names import shown
 from quad_envs.envs.shared.adjoint import SCRATCH_ROWS
 from quad_envs.envs.shared.task_vector import task_vector
-from quad_envs.envs.tracking.adjoint import action_slopes, tracking_vjp_rows
+from quad_envs.envs.tracking.adjoint import TrackingRecord, action_slopes, tracking_vjp_rows
 from quad_envs.envs.tracking.batch import TrackingBatch
 from quad_envs.envs.tracking.options import TrackingOptions
 from quad_envs.envs.tracking.scores import scores_of
@@ -35,20 +35,13 @@ _YAW = slice(5, 7)  # sine and cosine of it in an observation
 _HEADING = 6  # likewise of the reference in a stage of the preview
 
 
-class Record(NamedTuple):
+class TrackingStep(NamedTuple):
     """One step of all flights, as far as its adjoint needs it."""
 
-    plants: Array  # (n, 16), before
-    commands: Array  # (n, 4), N
-    previous: Array  # (n, 4), N, commands of the step before
-    after: Array  # (n, 16), afterwards, before any reset
-    references: Array  # (n, N_TABLE), of the time afterwards
-    crashed: Bools  # (n,)
-    force_max: Array  # (n, 4), N
-    coefficients: Array  # (n, N_COEFFICIENTS)
-    disturbances: Array  # (n, 2 substeps + 1, 6), at its stage times
+    record: TrackingRecord
     slopes: Array  # (n, 4), of the commands by the actions
     rewards: Array  # (n,)
+    crashed: Bools  # (n,)
     done: Bools  # (n,), flights that began anew
     axes: Floats  # (n, 2), sine and cosine of the angle by which the observation before was turned
     yaw: Floats  # (n, 2), of the yaw in it
@@ -96,12 +89,12 @@ class DifferentiableFlights:
     def begin_window(self, n_steps: int) -> None:
         """A window of n_steps follows; observations reach back to no earlier step."""
 
-    def observe_vjp(self, record: Record, bar: Floats) -> tuple[Array, Array]:
+    def observe_vjp(self, step: TrackingStep, bar: Floats) -> tuple[Array, Array]:
         """Sensitivities to plants (n, 16) and last commands (n, 4) before a step, from those to `observe`."""
         layout, full = self.task.layout, bar / np.asarray(self.features.scale)
         out, at = np.zeros((self.n, 16)), N_OWN
         out[:, 3:8] = full[:, :5]
-        out[:, 8] = full[:, 5] * record.yaw[:, 1] - full[:, 6] * record.yaw[:, 0]
+        out[:, 8] = full[:, 5] * step.yaw[:, 1] - full[:, 6] * step.yaw[:, 0]
         out[:, 9:16] = full[:, 7:14]
         if layout.position:
             out[:, :3] += full[:, at : at + 3]
@@ -109,7 +102,7 @@ class DifferentiableFlights:
         stages = preview_stages(layout.preview)
         preview = full[:, start : start + N_REFERENCE * len(stages)].reshape(self.n, -1, N_REFERENCE)
         x, y, z = preview[:, :, :3].sum(axis=1).T
-        sine, cosine = record.axes.T
+        sine, cosine = step.axes.T
         out[:, :3] -= np.stack([cosine * x - sine * y, sine * x + cosine * y, z], axis=1)
         return out, full[:, 14:18]
 
@@ -127,7 +120,7 @@ class DifferentiableFlights:
         s, c = axes.T
         return axes, np.stack([sine * c - cosine * s, cosine * c + sine * s], axis=1)
 
-    def advance(self, actions: Floats) -> Record:
+    def advance(self, actions: Floats) -> TrackingStep:
         """One step of all flights; those that end begin anew."""
         vehicles, references = self.batch.vehicles, self.batch.references
         plants, previous = vehicles.read(PLANT, N_PLANT), vehicles.read(COMMAND, N_INPUT)
@@ -139,7 +132,7 @@ class DifferentiableFlights:
         steps = np.minimum(vehicles.read(STEP).astype(np.int64), references.shape[1] - 1)
         self._cut -= 1
         done = scores.crashed | scores.truncated | (self._cut == 0)
-        record = Record(
+        record = TrackingRecord(
             plants=plants,
             commands=vehicles.read(COMMAND, N_INPUT),
             previous=previous,
@@ -149,24 +142,24 @@ class DifferentiableFlights:
             force_max=vehicles.read(FORCE_MAX, N_INPUT),
             coefficients=vehicles.read(COEFFICIENTS, N_COEFFICIENTS),
             disturbances=disturbances,
-            slopes=slopes,
-            rewards=scores.reward,
-            done=done,
-            axes=axes,
-            yaw=yaw,
         )
         if done.any():
             self._begin(np.flatnonzero(done))
         self._seen = self._observer.see(self._out, done)
-        return record
+        return TrackingStep(record, slopes, scores.reward, scores.crashed, done, axes, yaw)
 
     def advance_vjp(
-        self, record: Record, bar_after: Array, bar_commands: Array, bar_rewards: Array, bar_cost: float = 0.0
+        self,
+        step: TrackingStep,
+        bar_after: Array,
+        bar_commands: Array,
+        bar_rewards: Array,
+        bar_cost: float = 0.0,
     ) -> tuple[Array, Array, Array]:
         """Adjoint of `advance`.
 
         Args:
-            record: Of the step.
+            step: It.
             bar_after: Sensitivity to the plants afterwards, (n, 16).
             bar_commands: To the commands, as the next observation shows them, (n, 4).
             bar_rewards: To the rewards, (n,).
@@ -175,11 +168,11 @@ class DifferentiableFlights:
         Returns:
             Sensitivities to the actions (n, 4), the plants (n, 16) and the commands before (n, 4).
         """
-        flew_on = ~record.done[:, None]
+        flew_on = ~step.done[:, None]
         plants, commands, previous = np.empty((self.n, 16)), np.empty((self.n, 4)), np.empty((self.n, 4))
         tracking_vjp_rows(
-            *record[:9], self._vector, bar_after * flew_on, bar_rewards, np.float64(bar_cost),
+            step.record, self._vector, bar_after * flew_on, bar_rewards, np.float64(bar_cost),
             plants, commands, previous,
             self._scratch,
         )  # fmt: skip
-        return (commands + bar_commands * flew_on) * record.slopes, plants, previous
+        return (commands + bar_commands * flew_on) * step.slopes, plants, previous

@@ -6,6 +6,8 @@ is `quad_envs.envs.shared.adjoint` for the motion and `reward_vjp_rows` here for
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -147,17 +149,23 @@ def reward_vjp(
     return reward
 
 
+class TrackingRecord(NamedTuple):
+    """One step of n flights, as far as its adjoint needs it."""
+
+    plants: Array  # (n, 16), before
+    commands: Array  # (n, 4), N
+    previous: Array  # (n, 4), N, commands of the step before
+    after: Array  # (n, 16), afterwards, before any reset
+    references: Array  # (n, N_TABLE), of the time afterwards
+    crashed: NDArray[np.bool_]  # (n,), flights that ended in a crash: their reward is 0 and leads nowhere
+    force_max: Array  # (n, 4), N
+    coefficients: Array  # (n, N_COEFFICIENTS)
+    disturbances: Array  # (n, 2 substeps + 1, 6), at its stage times
+
+
 @kernel
 def tracking_vjp_rows(
-    plants: Array,
-    commands: Array,
-    previous: Array,
-    after: Array,
-    references: Array,
-    crashed: NDArray[np.bool_],
-    force_max: Array,
-    coefficients: Array,
-    disturbances: Array,
+    record: TrackingRecord,
     task: Array,
     bars: Array,
     bar_rewards: Array,
@@ -170,15 +178,7 @@ def tracking_vjp_rows(
     """Adjoint of one step of n flights: of the plant afterwards and of the reward.
 
     Args:
-        plants: Before the step, (n, 16).
-        commands: (n, 4), N.
-        previous: Commands of the step before, (n, 4), N.
-        after: Plants after the step, (n, 16).
-        references: Rows of the time after the step, (n, 9).
-        crashed: (n,), flights that ended in a crash: their reward is 0 and leads nowhere.
-        force_max: Rotor saturation of each, (n, 4), N.
-        coefficients: Of each, (n, N_COEFFICIENTS).
-        disturbances: At the stage times of the step, (n, 2 substeps + 1, 6).
+        record: Of the step.
         task: Task vector.
         bars: Sensitivity to the plants afterwards, (n, 16).
         bar_rewards: Sensitivity to the rewards, (n,).
@@ -191,15 +191,16 @@ def tracking_vjp_rows(
     substeps = int(task[SUBSTEPS])
     h = task[DT] / substeps
     work, total, direct = scratch[SCRATCH_ROWS : SCRATCH_ROWS + 2].reshape(-1), scratch[-2], scratch[-1]
+    plants, commands, previous = record.plants, record.commands, record.previous
     for j in range(plants.shape[0]):
-        if crashed[j]:
+        if record.crashed[j]:
             for i in range(16):
                 bar_plants[j, i] = 0.0
             for i in range(4):
                 bar_commands[j, i], bar_previous[j, i] = 0.0, 0.0
             continue
         reward_vjp(
-            after[j], references[j], commands[j], previous[j], task, bar_rewards[j], bar_cost,
+            record.after[j], record.references[j], commands[j], previous[j], task, bar_rewards[j], bar_cost,
             total, direct, bar_previous[j], work,
         )  # fmt: skip
         for i in range(12):
@@ -207,8 +208,8 @@ def tracking_vjp_rows(
         for i in range(12, 16):
             total[i] = bars[j, i]
         step_vjp_kernel(
-            plants[j], commands[j], force_max[j], coefficients[j], substeps, h, disturbances[j], total,
-            bar_plants[j], bar_commands[j], scratch,
+            plants[j], commands[j], record.force_max[j], record.coefficients[j], substeps, h,
+            record.disturbances[j], total, bar_plants[j], bar_commands[j], scratch,
         )  # fmt: skip
         for i in range(4):
             bar_commands[j, i] += direct[i]
