@@ -46,6 +46,18 @@ def _dot(a: Array, x: float, y: float, z: float) -> float:
     return float(a[0] * x + a[1] * y + a[2] * z)
 
 
+@inline_kernel
+def _rotors_vjp(b2: float, g0: float, g1: float, g2: float, c: Array, bar_F: Array) -> None:
+    """Sensitivity to the rotor forces, from b2 to the velocity along z_B and from g to the body rates."""
+    thrust, yaw = -c[INV_MASS] * b2, c[YAW_GAIN] * g2
+    ahead = c[PITCH_GAIN] * g1 - c[ROLL_CROSS] * g0  # of rotor 1, opposite to rotor 3
+    left = c[ROLL_GAIN] * g0 + c[PITCH_CROSS] * g1  # of rotor 4, opposite to rotor 2
+    bar_F[0] = thrust + ahead - yaw
+    bar_F[1] = thrust - left + yaw
+    bar_F[2] = thrust - ahead - yaw
+    bar_F[3] = thrust + left + yaw
+
+
 @kernel
 def rigid_body_vjp(x: Array, F: Array, d: Array, c: Array, bar: Array, bar_x: Array, bar_F: Array) -> None:
     """Adjoint of `dynamics.rigid_body`: bar_x = (df/dx)' bar, bar_F = (df/dF)' bar.
@@ -104,13 +116,7 @@ def rigid_body_vjp(x: Array, F: Array, d: Array, c: Array, bar: Array, bar_x: Ar
     bar_x[9] = b1 * w - b2 * v + e0 + g1 * c[GYRO_Y] * r + g2 * c[GYRO_Z] * q
     bar_x[10] = b2 * u - b0 * w + kin * sf / ct + e1 * cf + g0 * c[GYRO_X] * r + g2 * c[GYRO_Z] * p
     bar_x[11] = b0 * v - b1 * u + kin * cf / ct - e1 * sf + g0 * c[GYRO_X] * q + g1 * c[GYRO_Y] * p
-    thrust, yaw = -c[INV_MASS] * b2, c[YAW_GAIN] * g2
-    ahead = c[PITCH_GAIN] * g1 - c[ROLL_CROSS] * g0  # of rotor 1, opposite to rotor 3
-    left = c[ROLL_GAIN] * g0 + c[PITCH_CROSS] * g1  # of rotor 4, opposite to rotor 2
-    bar_F[0] = thrust + ahead - yaw
-    bar_F[1] = thrust - left + yaw
-    bar_F[2] = thrust - ahead - yaw
-    bar_F[3] = thrust + left + yaw
+    _rotors_vjp(b2, g0, g1, g2, c, bar_F)
 
 
 @inline_kernel

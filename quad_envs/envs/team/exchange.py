@@ -275,6 +275,19 @@ def _encode_measurements(
 
 
 @kernel
+def _encode_sensed(
+    i: int, motions: Array, sensed: int, which: Array, out: NDArray[np.float32], at: int
+) -> None:
+    """Positions and velocities of the vehicles that vehicle i senses, relative to its own."""
+    for s in range(which.shape[0]):
+        other = int(which[s]) if s < sensed else i  # relative to itself an empty slot is zero
+        out[at] = 1.0 if s < sensed else 0.0
+        for c in range(6):
+            out[at + 1 + c] = motions[other, c] - motions[i, c]
+        at += N_SENSED
+
+
+@kernel
 def observe_agent(
     i: int,
     w: Array,
@@ -328,12 +341,8 @@ def observe_agent(
     _encode_messages(k, messages, own, offsets, task, team, out, at)
     K = messages.shape[0]
     at += K * (N_COMM + N_PLAN_STAGE * int(team[PLAN_STAGES]))
-    for s in range(which.shape[0]):
-        other = int(which[s]) if s < sensed else i  # relative to itself an empty slot is zero
-        out[at] = 1.0 if s < sensed else 0.0
-        for c in range(6):
-            out[at + 1 + c] = motions[other, c] - motions[i, c]
-        at += N_SENSED
+    _encode_sensed(i, motions, sensed, which, out, at)
+    at += N_SENSED * which.shape[0]
     if team[SENSOR_ROWS] > 0.0:
         _encode_measurements(k, messages, measurement, team, out, at)
         at += N_MEASURED * (1 + K)
