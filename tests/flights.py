@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from controllers import ExactNmpc, LinearMPC, SdcNmpc
 from quad_envs.compilation.decorators import kernel
 from quad_envs.dynamics import arrive, disturbed_substep, load_air, place_vehicle, set_out
 from quad_envs.lanes import COMMAND, LANES, N_FLIGHT, PLANT
@@ -18,6 +19,13 @@ SUBSTEPS = 5
 TASK = Task()
 WEAK = Task(limits=Limits(kappa=0.3125))  # 2.45 N
 HOVER = TASK.hover_force
+FLAVOURS = {  # of MPC
+    "lmpc": LinearMPC,
+    "sdc": SdcNmpc,
+    "sdc-sdre": lambda task, **options: SdcNmpc(task, terminal_weight="sdre", **options),
+    "sdc-pass": lambda task, **options: SdcNmpc(task, relinearisations=1, **options),
+    "rti": ExactNmpc,
+}
 
 
 def helix(t):

@@ -33,3 +33,10 @@ def printed_compiled_and_plain(code):
         ).stdout
         for flag in "01"
     ]
+
+
+def printed_with_kernels_in(folder, script, *arguments):
+    """What a script prints that finds and leaves its compiled kernels in a folder."""
+    command = [sys.executable, str(script), *arguments]
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(folder)}
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout

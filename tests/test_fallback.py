@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from flights import HOVER, TASK, at_rest, decide_once, plan_of
+from flights import FLAVOURS, HOVER, TASK, at_rest, decide_once, plan_of
 
-from controllers import ExactNmpc, Fallback, LinearMPC, Lqr, SdcNmpc, Sdre
+from controllers import ExactNmpc, Fallback, LinearMPC, Lqr, Sdre
 from controllers.fallback import limit_command
 from quad_envs.parameters import Limits
 from quad_envs.tasks import Task
@@ -16,18 +16,11 @@ TIGHT = Task(limits=Limits(kappa=0.3125, rate=5.0, velocity=1.0))
 FAST = at_rest()
 FAST[3:6] = 3.0, -2.0, 1.0  # already beyond the velocity limit
 LAST = np.array([1.5, 2.4, 1.0, 2.0])
-MPCS = {
-    "lmpc": LinearMPC,
-    "sdc": SdcNmpc,
-    "sdc-sdre": lambda task, **options: SdcNmpc(task, terminal_weight="sdre", **options),
-    "sdc-pass": lambda task, **options: SdcNmpc(task, relinearisations=1, **options),
-    "rti": ExactNmpc,
-}
 
 
-@pytest.fixture(params=MPCS)
+@pytest.fixture(params=FLAVOURS)
 def mpc(request):
-    return MPCS[request.param]
+    return FLAVOURS[request.param]
 
 
 def assert_flyable(command, last, task):

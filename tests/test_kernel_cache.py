@@ -16,6 +16,7 @@ import pytest
 from numba import float32, float64, njit
 from numba.core import config
 from numba.core.registry import cpu_target
+from processes import printed_with_kernels_in
 
 from quad_envs.compilation import cache
 from quad_envs.compilation.decorators import kernel
@@ -338,9 +339,7 @@ def test_kernels_found_again_need_no_compiler_and_others_compile_beside_them(tmp
     script.write_text(EVERYTHING)
 
     def run(*arguments):
-        command = [sys.executable, str(script), *arguments]
-        environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+        return printed_with_kernels_in(tmp_path, script, *arguments)
 
     cold, warm, mixed = run(), run(), run("more")
     said = "Found(first=5.0, total=0.1524949"

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from flights import (
     DT,
+    FLAVOURS,
     HOVER,
     TASK,
     at_rest,
@@ -33,13 +34,6 @@ AWAY = at_rest((3.0, 3.0, 3.0))
 MOVING = np.r_[3, 3, 3, 1, 0.5, -0.5, 0.2, -0.3, 0.1, 0.5, 0.4, 0.1, np.full(4, HOVER)]
 SLOW = Task(limits=Limits(kappa=0.3125, rate=5.0))
 BOUNDED = Task(limits=Limits(0.3125, 5.0, 0.3, 2.0, (-20.0, -1.5, -20.0), (1.0, 20.0, 20.0)))
-FLAVOURS = {
-    "lmpc": LinearMPC,
-    "sdc": SdcNmpc,
-    "sdc-sdre": lambda task, **options: SdcNmpc(task, terminal_weight="sdre", **options),
-    "sdc-pass": lambda task, **options: SdcNmpc(task, relinearisations=1, **options),
-    "rti": ExactNmpc,
-}
 
 
 @pytest.fixture(params=FLAVOURS)

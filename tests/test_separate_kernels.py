@@ -1,13 +1,11 @@
 """A separate kernel is compiled once for all that call it, in whatever process."""
 
-import os
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from processes import printed_with_kernels_in
 
 from quad_envs.compilation import cache
 from quad_envs.compilation.decorators import kernel, separate_kernel
@@ -54,9 +52,7 @@ def shared(tmp_path):
     script.write_text(SHARED)
 
     def run(*names):
-        command = [sys.executable, str(script), *names]
-        environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+        return printed_with_kernels_in(tmp_path, script, *names)
 
     return run, tmp_path / "quad-envs"
 
