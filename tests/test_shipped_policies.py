@@ -9,9 +9,11 @@ from baselines import evaluate, make_policy, shipped_policies
 from baselines.policies.trained import SHIPPED, shipped_name
 from baselines.training.held_out import CHOOSING
 from baselines.training.shipping import judged
+from quad_envs import formation_v0
 from quad_envs.registration import TEAMS, TRACKING
 
 NAMES = sorted(shipped_policies())
+VEHICLES = 6  # of the hexagon
 
 
 def test_every_tracking_task_has_a_policy_of_each_class():
@@ -41,7 +43,20 @@ def test_scores_of_teams_are_of_many_independent_teams_and_say_their_interval():
     assert {said["algorithm"] for said in teams} == {"apg", "dagger"}
     for said in teams:
         assert said["starts"]["teams"] >= 100 and 0.0 < said["score_half_width"] < 0.05
-        assert said["crashes"] == 0 and said["min_separation"] > 0.4
+        assert said["min_separation"] > 0.4
+        # Stronger gusts than those of the environments, about a steady force, may carry a team off.
+        beyond = said["env_kwargs"].get("disturbance") == "varied-gusts"
+        assert said["crashes"] <= beyond * 0.03 * said["starts"]["teams"] * VEHICLES
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("air", [{}, {"disturbance": "gusts"}], ids=["still", "gusts"])
+def test_the_team_that_estimates_the_disturbance_stays_whole_in_gusts_and_ahead_of_the_mpc(air):
+    env = formation_v0.parallel_env(formation="hexagon", **air)
+    team = evaluate(make_policy("apg-formation", env), env, episodes=20, seed=10_000)
+    mpc = evaluate(make_policy("consensus-mpc", env, reject_disturbance=True), env, episodes=20, seed=10_000)
+    assert not any(record.crashed for record in team.records)
+    assert team.summary()["score"].mean > mpc.summary()["score"].mean + 0.04
 
 
 @pytest.mark.slow
