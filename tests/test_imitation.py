@@ -283,10 +283,9 @@ def test_dagger_is_within_one_percent_of_its_expert(tmp_path, seed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
-def test_the_policy_gradient_reaches_lmpc_to_one_percent(tmp_path, seed):
-    """It passed LMPC while that predicted from the velocity in turning axes: 0.70 then, 0.80 now."""
-    train(HELIX, "apg", seed=seed, steps=550_000, out=tmp_path)  # about 10 CPU-seconds
-    assert score(tmp_path, HELIX) > 0.99 * score("lmpc", HELIX)
+def test_the_policy_gradient_passes_lmpc(tmp_path, seed):
+    train(HELIX, "apg", seed=seed, steps=700_000, out=tmp_path)  # about 13 CPU-seconds
+    assert score(tmp_path, HELIX) > score("lmpc", HELIX)
 
 
 @pytest.mark.slow
