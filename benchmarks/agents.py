@@ -54,11 +54,12 @@ def _bare(n: int) -> _Candidate:
     env = formation_v0.parallel_env(vehicles=n, time_limit=_ENDLESS)
     env.reset(seed=0)
     batch, actions = env._batch, np.zeros((n, 4), dtype=np.float32)
-    out, steps = np.empty((n, env.task.layout.size), dtype=np.float32), max(1, 600 // n)
+    out, told = np.empty((n, env.task.layout.size), dtype=np.float32), batch.fresh_scores()
+    steps = max(1, 600 // n)
 
     def call() -> None:
         for _ in range(steps):
-            batch.step(actions, out)
+            batch.step(actions.reshape(-1), out.reshape(-1), told)
 
     return call, n * steps
 
