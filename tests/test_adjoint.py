@@ -72,7 +72,7 @@ def test_a_force_acts_through_the_attitude(substeps):
 
 
 def test_a_vehicle_in_gusts_is_taken_back_as_it_flew():
-    """Along its flight, the plants and rewards of the environment are those of the readable equations."""
+    """Along its flight, the plants of the environment are those of the readable equations."""
     env = gym.make("quad/HelixTracking-v0", disturbance="varied-gusts", substeps=2)
     flights = DifferentiableFlights(env.unwrapped.options, 6, 0)
     rng = np.random.default_rng(0)

@@ -1,8 +1,10 @@
 """Derivatives of the step by its adjoint, for policy gradients through the dynamics.
 
 Reverse mode by hand: `step_vjp` takes the sensitivity of any scalar to the plant after a control period back
-to the plant before it and to the rotor commands, for about four times the cost of the step. The plain step is
-`dynamics.simulate`; the tests compare with central differences.
+to the plant before it and to the rotor commands, for about four times the cost of the step. A disturbance is
+given: it does not depend on the plant, but its force, in inertial axes, acts on velocities in body axes
+through the attitude, as the weight does. The plain step is `dynamics.simulate`; the tests compare with
+central differences.
 """
 
 from __future__ import annotations

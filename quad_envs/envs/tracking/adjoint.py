@@ -1,7 +1,7 @@
 """The tracking task as a differentiable function: its step and reward, and their adjoints, for many flights.
 
 For policy gradients through the dynamics. The forward pass is the environments' own kernel; the backward pass
-is `quad_envs.envs.shared.adjoint` for the motion and `reward_vjp_rows` here for the reward.
+is `quad_envs.envs.shared.adjoint` for the motion and `reward_vjp` here for the reward.
 """
 
 from __future__ import annotations
