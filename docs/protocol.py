@@ -13,7 +13,6 @@ test holds the pages to what it writes.
 from __future__ import annotations
 
 import csv
-import io
 import json
 import math
 import re
@@ -26,8 +25,9 @@ from pathlib import Path
 from typing import Any
 
 from baselines import load_suite
-from baselines.files import write_atomic
+from baselines.files import write_atomic, write_csv
 from baselines.report.answer import percent, rounded
+from baselines.report.build import file_words
 from baselines.sweeps.contenders import ALL, VIOLATING, rank
 from baselines.sweeps.suite import BEST_MPC, Suite
 
@@ -83,9 +83,9 @@ def publish(run: Path) -> None:
     runs = [*(one for one in earlier if one["envs"]), flown]
     write_atomic(FACTS, (json.dumps({"protocol": said, "runs": runs}, indent=1) + "\n").encode())
     order = [env.title for env in load_suite(said["version"]).envs]
-    _write(NUMBERS, sorted([*stays, *new], key=lambda row: order.index(row["env"])))
+    write_csv(NUMBERS, sorted([*stays, *new], key=lambda row: order.index(row["env"])))
     for env in envs:
-        _take_frontiers(run, _stem(env))
+        _take_frontiers(run, file_words(env))
 
 
 def _cell(row: Row) -> tuple[str, ...]:
@@ -102,19 +102,6 @@ def _take_frontiers(run: Path, stem: str) -> None:
 def _read(path: Path) -> list[Row]:
     with path.open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
-
-
-def _write(path: Path, rows: Rows) -> None:
-    """All columns that some row has."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, dict.fromkeys(name for row in rows for name in row), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_atomic(path, text.getvalue().encode())
-
-
-def _stem(title: str) -> str:
-    return title.lower().replace(" ", "-")
 
 
 def published() -> list[Row]:
@@ -171,7 +158,7 @@ def tables() -> str:
     suite = load_suite(facts["protocol"]["version"])
     sections = list(_sections([one.label for one in suite.tables], published()))
     titles = [line[3:].strip() for line in sections if line.startswith("## ")]
-    links = " · ".join(f"[{title}](#{_stem(title.replace(',', ''))})" for title in titles)
+    links = " · ".join(f"[{title}](#{file_words(title)})" for title in titles)
     return "\n".join([_origin(facts, suite), f"{links}\n", *sections]) + "\n"
 
 
@@ -201,7 +188,7 @@ def _sections(labels: Sequence[str], rows: Rows) -> Iterator[str]:
             plain = [row for row in here if row["condition"] == NOMINAL]
             yield _markdown(_NUMBERS, sorted(plain, key=_rank))
             yield _conditions(here)
-            picture = f"frontier-{_stem(env)}-{_stem(label)}.svg"
+            picture = f"frontier-{file_words(env)}-{file_words(label)}.svg"
             if (PLACE / picture).exists():
                 yield f"![Score against quadratic cost, {env}, {label}]({picture})\n"
 

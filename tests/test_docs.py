@@ -19,6 +19,7 @@ import pytest
 from sources import ROOT, reads_sources
 
 from baselines.__main__ import main, make_parser
+from baselines.files import write_csv
 from baselines.report.benchmark import BenchmarkRequest
 from baselines.training.algorithms import ALGORITHMS
 from baselines.training.request import TrainingRequest
@@ -188,7 +189,7 @@ def protocol(tmp_path, monkeypatch):
         config = {"protocol": of, "git_revision": name * 10, "platform": "", "versions": {}}
         (run / "config.json").write_text(json.dumps(config))
         rows = [row for row in real if row["env"] == like and row["condition"] in conditions]
-        made._write(run / "contenders.csv", [row | {"env": env} for row in rows])
+        write_csv(run / "contenders.csv", [row | {"env": env} for row in rows])
         (run / f"frontier-{env.lower()}-nominal-levelled.svg").write_text(name)
         return run
 

@@ -138,9 +138,13 @@ def frontier_files(report: Report) -> dict[str, str]:
     for env in report.environments:
         for board in env.boards:
             if board.frontier.svg:
-                words = re.sub(r"[^a-z0-9]+", "-", f"{env.title} {board.title}".lower()).strip("-")
-                out[f"frontier-{words}.svg"] = as_file(board.frontier.svg)
+                out[f"frontier-{file_words(f'{env.title} {board.title}')}.svg"] = as_file(board.frontier.svg)
     return out
+
+
+def file_words(title: str) -> str:
+    """A title as words in the name of a file, or in an address."""
+    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
 
 def _starts(here: Sequence[Finished]) -> list[int]:
