@@ -123,6 +123,21 @@ def test_failures_are_counted_and_flyable():
     np.testing.assert_array_equal(lost.command, good.task.hover_force)
 
 
+@pytest.mark.parametrize(
+    ("vehicles", "place", "numbers"),
+    [(6, slice(3, 6), (1e10, -5e9, 3e9)), (3, 8, 1e24)],
+    ids=["speeds that leave the free minimum singular", "an angle that leaves OSQP no convex cost"],
+)
+def test_numbers_beyond_what_can_be_factored_end_in_hover(vehicles, place, numbers):
+    mpc = CentralMpc(team_task(vehicles))
+    plants = at_rest(0.5 * SORTED_START[:vehicles], mpc.task)
+    plants[2, place] = numbers
+    with np.errstate(all="ignore"):
+        lost = decide_centrally(mpc, plants, slots=TRIANGLE[:vehicles])
+    assert (lost.fallback == Fallback.HOVER).all()
+    np.testing.assert_array_equal(lost.command, mpc.task.hover_force)
+
+
 def test_bad_arguments_are_named():
     mpc = CentralMpc(team_task())
     plants = at_rest(LINE_START, mpc.task)

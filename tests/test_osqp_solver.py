@@ -69,6 +69,19 @@ def test_an_infeasible_problem_has_no_numbers_and_leaves_the_solver_usable():
     np.testing.assert_allclose(solver.solve(feasible).u, EXACT.solve(feasible).u, atol=1e-2)
 
 
+@pytest.mark.parametrize("used", [False, True], ids=["at the set-up", "at an update"])
+def test_a_matrix_that_cannot_be_factored_is_inaccurate_and_leaves_the_solver_usable(used):
+    solver, good = OsqpSolver(), hover_qp(3, FAR)
+    if used:
+        solver.solve(good)
+    rng = np.random.default_rng(0)
+    wild = good._replace(A=good.A + 1e200 * rng.normal(size=good.A.shape))
+    bad = solver.solve(wild)
+    assert bad.status in (Status.INACCURATE, Status.ITERATION_LIMIT)
+    assert np.isnan(bad.u).all()
+    np.testing.assert_array_equal(solver.solve(good).u, OsqpSolver().solve(good).u)
+
+
 def test_the_iteration_limit_is_reported():
     solution = OsqpSolver(max_iter=1).solve(hover_qp(10, FAR, upper=0.49, rate_step=0.25))
     assert solution.status == Status.ITERATION_LIMIT

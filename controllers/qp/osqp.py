@@ -4,9 +4,10 @@ Variables z = [u_0, x_1, u_1, x_2, .., u_{N-1}, x_N, s]; s are the slacks of the
 12N, box 4N, rate 4N, state rows from below and from above, s >= 0. Blocks are stored full, zeros included,
 so that new data fit the pattern of the first set-up and `update` suffices.
 
-Three facts make the checks necessary. An `update` with crossing bounds is refused with a print and the old
+Five facts make the checks necessary. An `update` with crossing bounds is refused with a print and the old
 data are solved. A vector of wrong length is accepted in silence. After "infeasible" the result is filled
-with a large finite number: only the status tells.
+with a large finite number: only the status tells. A set-up whose matrix rounding leaves without a factor
+raises. An `update` with one prints, and leaves a workspace that solves nothing any more.
 """
 
 from __future__ import annotations
@@ -243,15 +244,19 @@ class OsqpSolver:
             ValueError: If the problem is not well formed (`validate`).
         """
         validate(qp)
-        problem = self._problem
-        if problem is not None and problem.fits(qp, self._horizon):
-            problem.update(qp)
-        else:
-            problem = _Problem(qp, self.settings)
-            if self.persistent:
-                self._problem, self._horizon = problem, len(qp.c)
-        result = problem.solver.solve(raise_error=False)
-        return _read(qp, result)
+        kept, self._problem = self._problem, None  # kept again below: what has failed may stay wrong
+        try:
+            if kept is not None and kept.fits(qp, self._horizon):
+                kept.update(qp)
+                problem = kept
+            else:
+                problem = _Problem(qp, self.settings)
+        except osqp.OSQPException:
+            return _failed(qp, Status.INACCURATE, 0)
+        solution = _read(qp, problem.solver.solve(raise_error=False))
+        if self.persistent and solution.status == Status.OPTIMAL:
+            self._problem, self._horizon = problem, len(qp.c)
+        return solution
 
     def __getstate__(self) -> dict[str, Any]:
         """The settings alone: the OSQP object does not pickle and is built again on the first solve."""

@@ -163,10 +163,10 @@ class CentralMpc:
             old = kept[1 : 1 + n * N * N_INPUT].reshape(n, N, N_INPUT)
             forces = np.concatenate([old[:, 1:], old[:, -1:]], axis=1)
         else:
-            free = np.array([np.linalg.solve(part.H, -part.g) for part in condensed])
-            level = CLIPPED_SDRE if np.isfinite(free).all() else HOVER
-            if level == CLIPPED_SDRE:
-                forces += free.reshape(n, N, N_INPUT)
+            level, free = CLIPPED_SDRE, _unconstrained(condensed)
+            if free is None:
+                level, free = HOVER, np.zeros(forces.size)
+            forces += free.reshape(n, N, N_INPUT)
         command = np.empty((n, N_INPUT))
         for i in range(n):
             limit_command(forces[i, 0], last[i], self._data.rate_step, self._data.force_max, command[i])
@@ -328,7 +328,10 @@ class CentralMpc:
         P = _csc(triangle, sample.H.T[triangle.T])
         A = _csc(self._mask, sample.A.T[self._mask.T])
         solver = osqp.OSQP()
-        solver.setup(P, sample.g, A, lower, upper, verbose=False, **self._settings)
+        try:
+            solver.setup(P, sample.g, A, lower, upper, verbose=False, **self._settings)
+        except osqp.OSQPException:  # the numbers are such that rounding leaves no convex cost
+            return None, 0
         result = solver.solve(raise_error=False)
         iterations = int(result.info.iter)
         # After any other status x holds large finite numbers: only the status tells.
@@ -336,6 +339,15 @@ class CentralMpc:
             return None, iterations
         z = np.asarray(result.x, dtype=np.float64)
         return (z[:size], iterations) if np.isfinite(z).all() else (None, iterations)
+
+
+def _unconstrained(condensed: list[Condensed]) -> Array | None:
+    """Inputs of each vehicle that minimise its own cost without constraints, or None if none are found."""
+    try:
+        free = np.array([np.linalg.solve(part.H, -part.g) for part in condensed])
+    except np.linalg.LinAlgError:
+        return None
+    return free if np.isfinite(free).all() else None
 
 
 def _csc(mask: NDArray[np.bool_], values: Array) -> Any:
