@@ -101,6 +101,13 @@ def test_a_horizon_beyond_the_preview_is_refused_with_the_remedy():
         make_policy("lmpc", gymnasium.make(HELIX, preview=10), horizon=30)
 
 
+@pytest.mark.parametrize("name", ["lmpc", "safe:lmpc", "safe:hover"])
+def test_without_a_preview_no_horizon_helps_and_the_remedy_says_so(name):
+    env = gymnasium.make("quad/CorridorTracking-v0", preview=0)
+    with pytest.raises(ValueError, match=r"the observation (has )?0: gym\.make\(.*preview=\d+\)$"):
+        make_policy(name, env)
+
+
 def test_a_horizon_that_is_not_asked_for_shrinks_to_the_preview():
     assert make_policy("lmpc", gymnasium.make(HELIX, preview=10)).controller.horizon == 10
 

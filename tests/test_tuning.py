@@ -115,11 +115,68 @@ def test_what_is_tuned_follows_from_the_options_and_the_task():
 @pytest.mark.parametrize("env_id", [HELIX, "quad/CorridorTracking-v0"])
 @pytest.mark.parametrize("name", KNOBS)
 def test_every_point_of_a_search_is_an_option_that_is_allowed(name, env_id):
-    task, rng = task_of(env_id), np.random.default_rng(0)
+    limits = {"tilt_limit": 0.5} if env_id == HELIX else {}
+    task, rng = task_of(env_id, **limits), np.random.default_rng(0)
     search = make_search("nmpc", task, {"objective": "score", "reject_disturbance": True}, [name])
     for z in rng.uniform(-3.0, 3.0, (20, search.size)):
         NmpcOptions(**search.options(z))
         make_policy("nmpc", task, **search.options(z))
+
+
+@pytest.mark.parametrize(
+    ("name", "begin"),
+    [
+        ("Q", np.diag(np.arange(1.0, 13.0)).tolist()),
+        ("R", (2.0 * np.eye(4)).tolist()),
+        ("R_rate", [1.0, 2.0, 3.0, 4.0]),
+        ("R_rate", (2.0 * np.eye(4)).tolist()),
+        ("terminal", (3.0 * np.eye(12)).tolist()),
+        ("Q", 1e15),
+        ("R", [1e15] * 4),
+    ],
+)
+def test_a_search_begins_with_weights_of_every_form(name, begin):
+    task, rng = task_of(HELIX), np.random.default_rng(0)
+    given = {name: begin, "frame": "hover"} if name == "Q" else {name: begin}
+    search = make_search("nmpc", task, given, [name])
+    first = np.asarray(search.options(np.zeros(search.size))[name])
+    np.testing.assert_array_equal(first, begin * np.ones(first.shape))
+    for z in rng.uniform(-3.0, 3.0, (20, search.size)):
+        make_policy("nmpc", task, **search.options(z))
+
+
+def test_a_matrix_and_its_diagonal_are_searched_alike():
+    diagonal, z = [2.0, 2.0, *range(3, 13)], np.linspace(-1.0, 1.0, 8)
+    found, whole = (
+        np.array(make_search("nmpc", task_of(HELIX), {"Q": begin}, ["Q"]).options(z)["Q"])
+        for begin in (diagonal, np.diag(diagonal).tolist())
+    )
+    np.testing.assert_allclose(whole, np.diag(found), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("margin", {}, "margin changes nothing here.*it needs a limit of the state, as --set tilt_limit"),
+        ("floor", {}, "floor changes nothing here.*objective=score"),
+        ("estimator_gain", {}, "estimator_gain changes nothing here.*reject_disturbance=true"),
+        (
+            "estimator_gain_scale",
+            {"reject_disturbance": True, "estimator_gain": 0.3},
+            'estimator_gain_scale changes nothing here.*"auto"',
+        ),
+        (
+            "terminal",
+            {"terminal": 0.0},
+            "terminal is searched by factors, and 0 stays 0: begin with a number",
+        ),
+        ("Q", {"Q": 0.0}, "0 stays 0"),
+    ],
+)
+def test_an_option_whose_search_changes_nothing_is_refused(name, options, message):
+    with pytest.raises(ValueError, match=message):
+        make_search("nmpc", task_of(HELIX), options, [name])
+    assert name not in make_search("nmpc", task_of(HELIX), options).names
 
 
 def test_a_violation_or_a_crash_costs_more_than_any_score():
@@ -142,6 +199,8 @@ def test_a_violation_or_a_crash_costs_more_than_any_score():
         ({"seconds": 5.0, "episodes": 100}, "not both"),
         ({"seed": 100}, "seed of a tuning"),
         ({"options": {"horizn": 10}}, "horizn"),
+        ({"options": {"terminal": "x"}}, "terminal .*must be numbers, got 'x'"),
+        ({"fields": ("R", "R")}, "named twice: R, R"),
     ],
 )
 def test_a_tuning_that_cannot_be_done_is_refused_before_anything_is_written(tmp_path, changes, message):
@@ -150,9 +209,31 @@ def test_a_tuning_that_cannot_be_done_is_refused_before_anything_is_written(tmp_
     assert not (tmp_path / "t" / "config.json").exists()
 
 
-def test_a_policy_without_weights_has_nothing_to_tune(tmp_path):
-    with pytest.raises(ValueError, match="policy 'hover' has no option that can be tuned"):
-        tune(HELIX, "hover", out=tmp_path, env_kwargs=SHORT)
+@pytest.mark.parametrize("name", ["hover", "apg-helix"])
+def test_a_policy_without_weights_has_nothing_to_tune(tmp_path, name):
+    with pytest.raises(ValueError, match=f"policy '{name}' has no option that can be tuned.*some: lmpc, sdc"):
+        tune(HELIX, name, out=tmp_path, env_kwargs=SHORT)
+
+
+def test_where_a_team_has_nothing_to_tune_the_mpc_of_its_task_is_named():
+    import quad_envs
+
+    env = quad_envs.cooperative_estimation_v0.parallel_env()
+    with pytest.raises(ValueError, match=r"the MPCs have some: cooperative-mpc$"):
+        make_search("ekf", env.unwrapped.task, {})
+
+
+@pytest.mark.parametrize("name", ["code_of_a_stranger:make", "safe:nmpc", "apg-helix", "nix", "SELF"])
+def test_a_tuned_folder_names_a_controller_and_never_code(tmp_path, monkeypatch, name):
+    folder = tmp_path / "t"
+    tune(HELIX, "nmpc", episodes=GENERATION, out=folder, **FEW)
+    said = json.loads((folder / "tuned.json").read_text())
+    said["policy"], said["options"] = (str(folder) if name == "SELF" else name), {}
+    (folder / "tuned.json").write_text(json.dumps(said))
+    (tmp_path / "code_of_a_stranger.py").write_text("raise SystemExit('it ran')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(CheckpointError, match="is none that can be tuned; tune again"):
+        make_policy(folder, HELIX)
 
 
 def test_a_tuned_folder_is_refused_by_another_task_or_vehicle(tmp_path):

@@ -15,10 +15,11 @@ from quad_envs.arguments.field_comments import field_comments
 from quad_envs.arguments.kinds import holds_booleans, is_limit
 from quad_envs.arguments.names import shown, unknown_name
 
+from ..errors import CheckpointError
 from .outside import build, installed_policies, is_outside, names_factory, outside_options
 from .protocol import Policy
 from .trained import load_policy, names_trained, shipped_policies
-from .tuned import names_tuned, read_tuned
+from .tuned import DESCRIPTION, names_tuned, read_tuned
 
 if TYPE_CHECKING:  # not at run time: tasks load numba, and `quad-envs list` has to be quick
     from controllers.mpc.options import SafetyOptions
@@ -44,6 +45,7 @@ class PolicyEntry(NamedTuple):
     mpc: bool = False  # it plans with a model, and is what learned policies are asked to beat
 
 
+_LEAST_PLAN = 2  # samples, of a safety filter
 SAFE = "safe:"  # before the name of a policy: a safety filter stands in front of it
 _FORMATION, _TARGET, _ESTIMATION = "formation", "target-tracking", "estimation"
 TEAM_MISSIONS = (_FORMATION, _TARGET, _ESTIMATION)
@@ -252,9 +254,9 @@ def _filter_options() -> type[SafetyOptions]:
 
 
 def options_type(name: str) -> type[Any] | None:
-    """The dataclass of a policy's options, as of `policy_options`; None: it takes keywords."""
-    outside = _is_filtered(name) or from_outside(name)
-    return None if outside else _options_type(_factory(policy_entry(name)))
+    """The dataclass of a policy's options, as of `policy_options`; None: it takes keywords, or is trained."""
+    others = _is_filtered(name) or from_outside(name) or is_trained(name)
+    return None if others else _options_type(_factory(policy_entry(name)))
 
 
 def _options_type(factory: Callable[..., Any]) -> type[Any] | None:
@@ -324,6 +326,11 @@ def make_policy(name: str | os.PathLike[str] | Any, env: Any, **options: Any) ->
         if options:
             raise ValueError(f"a tuned policy has the options that were found, got {', '.join(options)}")
         tuned = read_tuned(name, task_of(env))
+        if tuned.policy not in TEAM_POLICIES | TRACKING_POLICIES:  # nor may a file say what code to run
+            raise CheckpointError(
+                f"tuned policy {os.fspath(name)!r}: policy {shown(tuned.policy)} in {DESCRIPTION} is none "
+                "that can be tuned; tune again with quad-envs tune"
+            )
         policy: Any = make_policy(tuned.policy, env, **tuned.options)
         policy.name = os.path.basename(os.path.abspath(name))
         return cast("Policy", policy)
@@ -367,8 +374,13 @@ def safe(policy: str | os.PathLike[str] | Any, env: Any, **options: Any) -> Poli
     known = _known_options(SAFE)
     _check_options(f"{SAFE}NAME", known, options)
     preview = task.layout.preview
-    options.setdefault("horizon", min(known["horizon"].default, max(preview, 1)))
     kind = _filter_options()
+    if preview < _LEAST_PLAN:
+        raise ValueError(
+            f"a safety filter plans {_LEAST_PLAN} samples along the preview or more, the observation has "
+            f"{preview}: gym.make({task.env_id!r}, preview=25)"
+        )
+    options.setdefault("horizon", min(known["horizon"].default, preview))
     if isinstance(options["horizon"], int) and options["horizon"] > preview:
         raise ValueError(
             f"a safety filter looks {options['horizon']} steps ahead, the observation {preview}: choose "
@@ -406,16 +418,19 @@ def _make_tracking_policy(
     from .tracking import ControllerPolicy
 
     preview = task.layout.preview
+    wanted: Any = options.get("horizon", defaults.get("horizon"))
     if "horizon" in defaults:
-        options.setdefault("horizon", min(defaults["horizon"], preview))
+        options.setdefault("horizon", max(1, min(wanted, preview)))
     if "acceleration_feed_forward" in defaults:
         options.setdefault("acceleration_feed_forward", defaults["acceleration_feed_forward"] and preview > 0)
     controller = _built(name, factory, task, options)
     if controller.horizon > preview:
-        remedy = f"horizon <= {preview}" if "horizon" in defaults else "acceleration_feed_forward=False"
+        remedy = "" if preview == 0 else f"choose horizon <= {preview}, or "
+        if "horizon" not in defaults:
+            remedy = "choose acceleration_feed_forward=False, or "
         raise ValueError(
             f"policy {name!r} looks {controller.horizon} steps ahead, the observation {preview}: "
-            f"choose {remedy}, or gym.make({task.env_id!r}, preview={controller.horizon})"
+            f"{remedy}gym.make({task.env_id!r}, preview={wanted or controller.horizon})"
         )
     return ControllerPolicy(controller, task, name)
 
@@ -432,9 +447,10 @@ def _make_team_policy(
     if "horizon" in defaults and task.mission == _FORMATION:
         horizon = options.setdefault("horizon", max(1, min(defaults["horizon"], preview)))
         if horizon > preview:
+            remedy = "" if preview == 0 else f"choose horizon <= {preview}, or "
             raise ValueError(
-                f"policy {name!r} looks {horizon} steps ahead, the leader sees {preview}: choose horizon <= "
-                f"{preview}, or make {task.env_id!r} with preview={horizon}"
+                f"policy {name!r} looks {horizon} steps ahead, the leader sees {preview}: {remedy}make "
+                f"{task.env_id!r} with preview={horizon}"
             )
     policy: Policy = _built(name, factory, task, options)
     return policy

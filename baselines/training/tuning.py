@@ -44,7 +44,7 @@ from ..files import (
     write_json,
 )
 from ..interruptions import held, raise_lost, remembered
-from ..policies.registry import make_policy
+from ..policies.registry import from_outside, make_policy
 from ..policies.tuned import DESCRIPTION, TunedPolicy, vehicle_of, write_tuned
 from .clock import TrainingClock
 from .held_out import HELD_OUT, HeldOutFlights, Point, Progress, read_point, training_options
@@ -151,7 +151,10 @@ def check_tuning(request: TuningRequest) -> Search:
         ValueError: If an argument is not allowed, or the policy has nothing to tune.
     """
     task = training_options(request.env_id, dict(request.env_kwargs or {})).task
-    search = make_search(request.policy, task, request.options or {}, request.fields)
+    given = request.options or {}
+    if not from_outside(request.policy):
+        make_policy(request.policy, task, **given)  # says what of the options is not allowed
+    search = make_search(request.policy, task, given, request.fields)
     make_policy(request.policy, task, **search.options(np.zeros(search.size)))
     _require_a_generation(request, _cma(search, np.zeros(search.size)).population_size)
     return search
