@@ -195,7 +195,7 @@ def test_one_vehicle_is_refused_with_the_remedy(tmp_path):
         (FORMATION, {"graph": "complete"}, LIKE, "dagger-formation", r"'comm'.*choose a graph in which"),
         (FORMATION, {"sensed": 2}, LIKE, "dagger-formation", r"'sensed'.*pass sensed=5"),
         (FORMATION, {}, {"net_arch": [8]}, "dagger-formation", r"give the same net_arch"),
-        (FORMATION, {}, LIKE, "apg-helix", r"cannot go on from a network that sees"),
+        (FORMATION, {}, LIKE, "apg-helix", r"no training on quad/Formation-v0.*can go on"),
     ],
 )
 def test_what_cannot_be_trained_in_a_team_is_refused_before_anything_is_written(

@@ -295,6 +295,8 @@ def test_columns_that_are_no_trajectory_are_refused(columns, message):
     [
         ("t,x,y,z\n0,0,0,0\n0.1," + "1" * 200_000 + ",0,0\n", "line 3: a cell is longer"),
         ('t,x,y,z\n0,0,0,0\n0.1,"0,0,0\n', "line 3: a quote is not closed"),
+        ("t,x,y,z,x\n0,0,0,0,0\n1,0,0,0,0\n", "names x twice, as 'x' and 'x'; give one of them another name"),
+        ("t,x,y\n0,0,0\n1,0,0\n", r"missing \['z'\], unknown: none\. names={'z': 'what it is called'} says"),
         ("t,x,y,z,pos_x\n0,0,0,0,0\n1,0,0,0,0\n", "names x twice, as 'x' and 'pos_x'"),
         ("t,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,0,0,0,0,0,0,3\n", "line 3: a quaternion of length 3"),
         ("t,x,y,z,qx\n0,0,0,0,0\n", "all of qx, qy, qz, qw or none"),

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from quad_envs.arguments.names import shown
+from quad_envs.tasks import Task, TeamTask
 
-from ..errors import ResultsError
+from ..errors import CheckpointError, ResultsError
 from ..policies.checkpoints import load_checkpoint
 from ..policies.network import Network
 from ..policies.trained import checkpoint_folder
+from ..policies.tuned import names_tuned
 from .algorithm_options import check_sizes
 from .algorithms import algorithm_for, check_training, require_packages, require_resumable
 from .beginning import with_estimate_inputs
@@ -81,7 +84,7 @@ def make_plan(request: TrainingRequest) -> Plan:
     options = hyperparameters(algorithm, env_id, request.hyper)
     check_sizes(options, task_options.task.layout.size)
     source = request.start_from
-    network, origin = (None, None) if source is None else _origin(source, algorithm)
+    network, origin = (None, None) if source is None else _origin(source, algorithm, task_options.task)
     if network is not None and getattr(options, "disturbance_estimate", False):
         network = with_estimate_inputs(network, task_options.task)
     check_training(algorithm, task_options, options, network)
@@ -100,10 +103,22 @@ def make_plan(request: TrainingRequest) -> Plan:
     return Plan(env_id, kwargs, algorithm, seed, budget, task_options, options, about, network)
 
 
-def _origin(source: str | Path, algorithm: str) -> tuple[Network, dict[str, Any]]:
+def _origin(source: str | Path, algorithm: str, task: Task | TeamTask) -> tuple[Network, dict[str, Any]]:
     """The network to begin with, and what made it."""
     require_resumable(algorithm)
+    if names_tuned(source):
+        raise CheckpointError(
+            f"{os.fspath(source)!r} is a tuned policy, which has no network to begin with: name the folder "
+            "of a training, or a shipped network"
+        )
     network, said = load_checkpoint(checkpoint_folder(source))
+    mission = said.get("mission")
+    if mission is not None and mission != task.mission:
+        raise CheckpointError(
+            f"{os.fspath(source)!r} was trained on {shown(said.get('env_id'))}, a task of the kind "
+            f"{shown(mission)}, and no training on {task.env_id}, one of {task.mission}, can go on from it: "
+            "begin with a network of the same kind"
+        )
     return network, {name: said[name] for name in _ORIGIN if name in said}
 
 

@@ -10,6 +10,7 @@ import inspect
 import math
 from collections.abc import Callable
 from dataclasses import fields, replace
+from itertools import pairwise
 from typing import Any, TypeVar
 
 import numpy as np
@@ -25,10 +26,11 @@ from quad_envs.wrappers.encoded_space import stages_of
 from quad_envs.wrappers.encoding import Encoding
 
 from ..errors import TrainingError
+from ..policies.disturbance_estimate import sees_estimate
 from ..policies.network import Network
 from .algorithm_options import PpoLagrangianOptions, PpoOptions, SacOptions
 from .beginning import require_continuable
-from .features import require_measured, training_features
+from .features import require_measured, training_features, training_task
 from .held_out import Progress, Training
 from .lagrangian import LagrangianBuffer, LagrangianEnv, Multiplier, Probe
 from .learner import RowBuffer, RowPPO, Tanh
@@ -40,18 +42,53 @@ _NEVER = 2**31  # updates between logs of stable-baselines3; runs keep their own
 
 
 def check(task_options: TaskOptions, options: PpoOptions | SacOptions, start: Network | None = None) -> None:
-    """Refuse in a team what training would, before anything is written.
+    """Refuse what training would, before anything is written.
 
     Raises:
         ValueError: If nobody measures a target, or training cannot go on from `start`.
     """
-    if not isinstance(task_options, TeamOptions):
+    if isinstance(task_options, TeamOptions):
+        require_measured(task_options)
+    sees = options.disturbance_estimate, options.heading_axes
+    features = training_features(task_options, options.stages, *sees)
+    if start is None:
         return
-    require_measured(task_options)
-    if start is not None:
-        sees = options.disturbance_estimate, options.heading_axes
-        features = training_features(task_options, options.stages, *sees)
+    if isinstance(task_options, TeamOptions):
         require_continuable(start, features, options.net_arch, 4, "clip")
+        return
+    # One vehicle goes on with what the network sees, if it is there and nothing else is asked for.
+    seen = start.features
+    layout = replace(training_task(task_options).layout, disturbance_estimate=sees_estimate(seen))
+    seen.columns(layout)  # says what is missing
+    others = options.stages is not None and features.names != seen.names
+    if others or (options.heading_axes and not seen.heading_axes):
+        raise ValueError(
+            "a training that goes on from a network sees what that one sees, not other stages or "
+            "heading_axes: leave these hyperparameters out, or begin without a network"
+        )
+    wanted = list(pairwise((len(seen.names), *options.net_arch, 4)))
+    require_layers(start, wanted, "tanh" if isinstance(options, SacOptions) else "clip")
+
+
+def require_layers(network: Network, wanted: list[tuple[int, int]], squash: str) -> None:
+    """Check that a learner can take over a network.
+
+    Args:
+        network: To begin with.
+        wanted: (inputs, outputs) of each layer of the learner.
+        squash: How its outputs come into [-1, 1].
+
+    Raises:
+        ValueError: If not.
+    """
+    found = [tuple(W.shape) for W in network.weights]
+    kinds = network.squash, network.commands, network.activation
+    if found != wanted or kinds != (squash, "hover", "tanh"):
+        raise ValueError(
+            f"the network has layers {found}, squash, commands and activation {kinds}, this training "
+            f"{wanted} and {(squash, 'hover', 'tanh')}: go on with the algorithm and the net_arch that "
+            "made it"
+        )
 
 
 def train_ppo(
@@ -248,15 +285,7 @@ def take_over(model: PPO | SAC, network: Network) -> None:
     """
     layers = _policy_layers(model)
     wanted = [(layer.in_features, layer.out_features) for layer in layers]
-    found = [tuple(W.shape) for W in network.weights]
-    squash = "tanh" if isinstance(model, SAC) else "clip"
-    kinds = network.squash, network.commands, network.activation
-    if found != wanted or kinds != (squash, "hover", "tanh"):
-        raise ValueError(
-            f"the network has layers {found}, squash, commands and activation {kinds}, this training "
-            f"{wanted} and {(squash, 'hover', 'tanh')}: go on with the algorithm and the net_arch that "
-            "made it"
-        )
+    require_layers(network, wanted, "tanh" if isinstance(model, SAC) else "clip")
     with torch.no_grad():
         for layer, W, b in zip(layers, network.weights, network.biases, strict=True):
             layer.weight.copy_(torch.from_numpy(W.T))

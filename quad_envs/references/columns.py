@@ -79,9 +79,12 @@ def find_columns(
             ignored.append(name.strip())
             continue
         if column in found:
+            first = header[found[column].at]
+            alike = first.strip() == name.strip()  # a name then tells nothing
+            remedy = f"say which is meant, as names={{'{column}': {shown(name)}}}"
             raise ValueError(
-                f"{source}: the header names {column} twice, as {shown(header[found[column].at])} and "
-                f"{shown(name)}; say which is meant, as names={{'{column}': {shown(name)}}}"
+                f"{source}: the header names {column} twice, as {shown(first)} and {shown(name)}; "
+                f"{'give one of them another name' if alike else remedy}"
             )
         if unit and unit not in _UNITS[column]:
             raise ValueError(
@@ -142,7 +145,7 @@ def _require_whole(found: Mapping[str, Column], ignored: Sequence[str], source: 
         raise ValueError(
             f"{source}: the header must name {', '.join(NEEDED)} (and may name {', '.join(COLUMNS[4:])}); "
             f"missing {missing}, unknown: {listed(ignored) or 'none'}. names={{'{missing[0]}': 'what it is "
-            "called'}} says which column is meant"
+            f"called'}} says which column is meant"
         )
     for group in (VELOCITIES, QUATERNION):
         given = [name in found for name in group]
