@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from stub_training import stubs  # noqa: F401
 
-from baselines import ResultsError, Suite, load_suite, run_benchmark
+from baselines import PolicyError, ResultsError, Suite, load_suite, run_benchmark
 from baselines.policies.environments import make_env
 from baselines.sweeps.contenders import ALL
 from baselines.sweeps.finished import train_unit
@@ -41,6 +41,30 @@ def test_a_suite_trains_one_network_per_environment_and_seed_and_flies_it_under_
     names = {(u.env.title, u.policy.title): u.policy_name for u in suite_units(suite)}
     assert names["Helix, nominal", "stub, seed 1"] == names["Helix, weak", "stub, seed 1"]
     assert names["Helix, nominal", "stub, seed 1"] != names["Random, nominal", "stub, seed 1"]
+
+
+@pytest.mark.parametrize("others", [["lqr"], []])
+def test_a_task_that_the_only_tuning_does_not_survive_leaves_the_other_policies(tmp_path, others):
+    rolling = (0.0,) * 6 + (1.4, 0.0, 0.0, 30.0, 0.0, 0.0)  # past 85 degrees within a sample
+    tuned = {"name": "lmpc", "tune": {"seeds": [0], "episodes": 32, "fields": ["terminal"]}}
+    suite = {
+        "name": "doomed",
+        "episodes": 2,
+        "envs": [{"id": "quad/HelixTracking-v0", "kwargs": {"start": rolling, "start_box": 0.0, **SHORT}}],
+        "policies": [tuned, *others],
+    }
+    said = "it could not be tuned: no candidate for 'lmpc' stays in the air"
+    if not others:
+        with pytest.raises(PolicyError, match=said):
+            run_benchmark(suite, tmp_path)
+        return
+    with pytest.warns(UserWarning, match=said):
+        results = run_benchmark(suite, tmp_path)
+    assert [(each.policy, each.message[: len(said)]) for each in results.failures] == [
+        ("lmpc, tuned, seed 0", said)
+    ]
+    assert [evaluation.policy for evaluation in results.evaluations] == ["lqr"]
+    assert (tmp_path / "report.html").exists()
 
 
 def test_a_stored_suite_is_read_again():

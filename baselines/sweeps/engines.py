@@ -71,9 +71,8 @@ def run_units(
         jobs: How many at a time; None: one here, all that a cluster has.
     """
     if engine == "processes" and ((jobs or 1) == 1 or len(units) < 2):
-        for unit in units:  # the only one fails as it is: there is nothing to go on with
-            result = work(unit) if len(units) == 1 else tried(work, unit)
-            yield unit.number, result  # type: ignore[attr-defined]
+        for unit in units:
+            yield unit.number, tried(work, unit)  # type: ignore[attr-defined]
         return
     if not units:  # a cluster need not be joined
         return

@@ -150,10 +150,11 @@ class Sweep:
             self.order.on_unit(self.done, len(self.to_train) + len(self.units))
 
     def _lose(self, training: TrainingUnit, why: str) -> None:
-        """Nothing flies that needs this network."""
+        """Nothing flies that needs this network, or what was to be tuned."""
+        what = "trained" if training.policy.train is not None else "tuned"
         for unit in self.units:
             if unit.policy is training.policy and unit.policy_name == str(training.folder):
-                self._fail(unit.number, f"its network could not be trained: {why}")
+                self._fail(unit.number, f"it could not be {what}: {why}")
 
     def _fail(self, number: int, why: str) -> None:
         """A unit is not to be had; of one in several blocks this is said once."""
