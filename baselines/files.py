@@ -99,6 +99,15 @@ def plain_json(value: Any) -> Any:
     return value
 
 
+def is_plain(value: Any) -> bool:
+    """Whether a value, from `plain_json`, is one that JSON has."""
+    if isinstance(value, dict):
+        return all(map(is_plain, value.values()))
+    if isinstance(value, list):
+        return all(map(is_plain, value))
+    return value is None or isinstance(value, str | int | float)
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write a value as JSON."""
     write_atomic(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())

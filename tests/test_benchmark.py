@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import errno
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -24,7 +25,10 @@ from baselines.policies.registry import TRACKING_POLICIES
 from baselines.policies.trained import SHIPPED
 from baselines.sweeps.folder import read_run
 from baselines.sweeps.suite_files import suite_names
+from quad_envs import Helix, from_function
 from quad_envs.registration import TRACKING
+
+HELIX = "quad/HelixTracking-v0"
 
 SMALL = {
     "name": "small",
@@ -222,6 +226,25 @@ def test_titles_that_differ_in_other_characters_have_files_of_their_own(tmp_path
     assert len(list((tmp_path / "cells").iterdir())) == 4
     again = run_benchmark(SMALL | {"policies": policies, "compare_with": ""}, tmp_path)
     assert again.rows() == results.rows()
+
+
+@pytest.mark.parametrize("start", [(0.0,) * 12, np.zeros(12), (0.0, np.float64(0.0), 0.0)])
+@pytest.mark.parametrize("rate_limit", [5.0, math.inf])
+def test_arguments_that_json_changes_have_the_title_that_is_read_again(tmp_path, start, rate_limit):
+    kwargs = {"start": start, "start_box": 0.0, "rate_limit": rate_limit, "time_limit": 0.2}
+    suite = {"name": "a", "episodes": 1, "envs": [{"id": HELIX, "kwargs": kwargs}], "policies": ["lqr"]}
+    run_benchmark(suite, tmp_path)  # whose page reads the folder
+    assert (tmp_path / "report.html").exists()
+
+
+@pytest.mark.parametrize("reference", [Helix(radius=1.0), from_function(lambda t: [t, 0.0, 0.0])])
+def test_objects_in_a_suite_fly_without_a_folder_alone(tmp_path, reference):
+    kwargs = {"reference": reference, "time_limit": 0.2}
+    suite = {"name": "a", "episodes": 1, "envs": [{"id": HELIX, "kwargs": kwargs}], "policies": ["lqr"]}
+    assert run_benchmark(suite).evaluations[0].flights == 1
+    with pytest.raises(ValueError, match=r"reference of .* which a results folder cannot hold: say it"):
+        run_benchmark(suite, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_results_of_another_numpy_are_not_mixed(tmp_path, monkeypatch):

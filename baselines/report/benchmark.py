@@ -17,11 +17,11 @@ from quad_envs.arguments.names import shown
 
 from ..errors import ResultsError
 from ..evaluation.amounts import require_jobs
-from ..files import locked, write_atomic
+from ..files import is_plain, locked, plain_json, write_atomic
 from ..policies.environments import make_env
 from ..policies.outside import name_of
 from ..policies.registry import behind_filter, from_outside, is_trained, make_policy, policy_entry
-from ..sweeps.choices import PolicyChoice
+from ..sweeps.choices import Condition, EnvChoice, PolicyChoice
 from ..sweeps.comparison import Results
 from ..sweeps.engines import SHARED_FOLDER, check_engine
 from ..sweeps.finished import check_unit
@@ -99,6 +99,8 @@ def fly_suite(
         require_jobs(order.jobs, here=order.engine == "processes")
     require_disjoint_starts(suite)
     _refuse_no_folder(suite, out, order)
+    if out is not None:
+        _refuse_objects(suite)
     if order.engine == SHARED_FOLDER:
         _refuse_unshared(given, order)
     failed = _refuse_bad_units(suite, given)
@@ -125,6 +127,19 @@ def _refuse_no_folder(suite: Suite, out: str | Path | None, order: Order) -> Non
         raise ValueError(
             f"suite {suite.name!r} trains or tunes policies, which need a folder: give out or networks"
         )
+
+
+def _refuse_objects(suite: Suite) -> None:
+    """A folder holds arguments as JSON has them, to read them again."""
+    choices: list[EnvChoice | Condition | PolicyChoice] = [*suite.envs, *suite.conditions, *suite.policies]
+    for choice in choices:
+        for name, value in choice.kwargs.items():
+            if not is_plain(plain_json(value)):
+                raise ValueError(
+                    f"suite {suite.name!r}: {name} of {choice.title!r} is {shown(value)}, which a results "
+                    "folder cannot hold: say it by name or as a mapping, as {'kind': 'helix', 'radius': 2.0}, "
+                    "or leave out the folder"
+                )
 
 
 def _refuse_unshared(given: Mapping[str, Given], order: Order) -> None:

@@ -10,6 +10,8 @@ from quad_envs.arguments.checks import require_whole
 from quad_envs.arguments.names import shown
 from quad_envs.registration import TEAMS
 
+from ..files import plain_json
+
 TEAMS_PART, TRACKING_PART = "teams", "tracking"
 PARTS = (TRACKING_PART, TEAMS_PART)  # environments of one vehicle, and of several
 _QUICK_SECONDS = 3.0  # CPU-seconds of a training in a quick suite, where none are given
@@ -233,4 +235,6 @@ def flies_in(policy: PolicyChoice, env: EnvChoice) -> bool:
 
 
 def _title(name: str, kwargs: Mapping[str, Any]) -> str:
+    """Name and arguments as a folder holds them, so that what is read there has the title that was flown."""
+    kwargs = plain_json(kwargs)
     return ", ".join([name, *(f"{key}={value}" for key, value in kwargs.items())])
