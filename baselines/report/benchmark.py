@@ -137,7 +137,7 @@ def _refuse_objects(suite: Suite) -> None:
             if not is_plain(plain_json(value)):
                 raise ValueError(
                     f"suite {suite.name!r}: {name} of {choice.title!r} is {shown(value)}, which a results "
-                    "folder cannot hold: say it by name or as a mapping, as {'kind': 'helix', 'radius': 2.0}, "
+                    "folder cannot hold: say it by name or as a mapping, as {'kind': 'helix'}, "
                     "or leave out the folder"
                 )
 
