@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from .cli.options import (
     BenchmarkOptions,
@@ -145,11 +146,22 @@ COMMANDS: dict[str, Command] = {
 }
 
 
+class _Version(argparse.Action):
+    """Prints the version, which is looked up when it is asked for."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *given: Any) -> NoReturn:
+        from quad_envs import __version__
+
+        print(f"quad-envs {__version__}")
+        parser.exit()
+
+
 def make_parser() -> Parser:
     """The parser of all commands."""
     parser = Parser(
         prog="quad-envs", description="Quadrotor environments with MPC baselines.", allow_abbrev=False
     )
+    parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, command in COMMANDS.items():
         summary = str(command.options.__doc__)

@@ -201,6 +201,11 @@ class LimitOptions:
                 raise ValueError(
                     f"{limit.option} must be None or ((x, y, z) lower, (x, y, z) upper), got {shown(box)}"
                 )
+            if not limit.box and not isinstance(box, int | float | np.integer | np.floating):
+                raise ValueError(
+                    f"{limit.option} must be a number, {limit.given_unit} (math.inf for none), "
+                    f"got {shown(box)}"
+                )
 
     def make_limits(self) -> Limits:
         """The limits that are set."""

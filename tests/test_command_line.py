@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import gymnasium
+import numpy as np
 import pytest
 from commands import fails
 from processes import start_command
@@ -20,8 +21,10 @@ from processes import start_command
 from baselines.__main__ import COMMANDS, main
 from baselines.cli.commands import _resume
 from baselines.cli.options import BenchmarkOptions, read_assignments
+from baselines.cli.values import read_value
 from baselines.policies.registry import TEAM_POLICIES, TRACKING_POLICIES, policy_comments, policy_options
 from baselines.sweeps.sweep import REPORTED
+from quad_envs import __version__
 from quad_envs.registration import TEAMS, TRACKING
 
 HELIX = "quad/HelixTracking-v0"
@@ -159,7 +162,12 @@ def test_evaluate_discards_another_run_if_asked_to(capsys, tmp_path):
         (["evaluate", HELIX, "hover", "--set", "kappa"], "--set needs KEY=VALUE"),
         (["evaluate", HELIX, "hover", "--set", "kappa=1", "--set", "kappa=1"], "sets 'kappa' twice"),
         (["evaluate", HELIX, "hover", "--episodes", "0"], "episodes must be a whole number >= 1, got 0"),
-        (["evaluate", HELIX, "hover", "--episodes", "many"], "invalid int value: 'many'"),
+        (
+            ["evaluate", HELIX, "hover", "--episodes", "many"],
+            "--episodes: must be a whole number, got 'many'",
+        ),
+        (["train", HELIX, "apg", "--seconds", "few"], "--seconds: must be a number, got 'few'"),
+        (["evaluate", HELIX, "hover", "--set", "tilt_limit=much"], "tilt_limit must be a number, rad"),
         (["evaluate", HELIX, "hover", "--episode", "3"], "did you mean '--episodes'"),
         (["evaluate", HELIX, "hover", "more"], "unexpected argument 'more'"),
         (["evaluate", HELIX, "hover", "--save-episodes"], "needs a folder: --out FOLDER"),
@@ -238,6 +246,38 @@ def test_list_names_every_environment_and_policy(capsys):
 def test_list_shows_the_options_of_a_name(capsys, name, option):
     assert main(["list", name, "--json"]) == 0
     assert option in json.loads(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "value"),
+    [
+        ("crazyflie", "mass", 0.027),
+        ("ppo-corridor", "env_id", "quad/CorridorTracking-v0"),
+        ("quick", "seed", 0),
+    ],
+)
+def test_list_shows_what_a_name_without_options_is(capsys, name, key, value):
+    assert main(["list", name, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)[key] == value
+    assert main(["list", name]) == 0
+    assert name in capsys.readouterr().out.splitlines()[0]
+
+
+def test_every_name_of_the_list_can_be_listed(capsys):
+    assert main(["list", "--json"]) == 0
+    for name in {name for shelf in json.loads(capsys.readouterr().out).values() for name in shelf}:
+        assert main(["list", name]) == 0, name
+
+
+def test_version_is_that_of_the_package(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    assert ended.value.code == 0 and capsys.readouterr().out == f"quad-envs {__version__}\n"
+
+
+@pytest.mark.parametrize(("text", "value"), [("inf", np.inf), ("-inf", -np.inf), ("[1, inf]", [1, np.inf])])
+def test_infinity_is_read_as_list_shows_it(text, value):
+    assert read_value(text) == value
 
 
 @pytest.mark.parametrize(

@@ -77,8 +77,9 @@ def list_names(options: ListOptions) -> int:
         print(shelf.title)
         for name, entry in entries.items():
             text = entry if isinstance(entry, str) else ", ".join(f"{k}={v!r}" for k, v in entry.items())
-            print(f"  {name:28} {text}")
-    print("\nquad-envs list NAME shows the options of an environment, a policy or a training algorithm")
+            print(f"  {name:29} {text}")
+    print("\nquad-envs list NAME shows the options of an environment, a policy or a training algorithm,")
+    print("and what a vehicle, a trained policy or a suite is")
     print("safe:NAME puts a safety filter in front of any policy for one vehicle")
     return 0
 
@@ -149,6 +150,7 @@ def _list_options(options: ListOptions) -> int:
 
     names = [*TRACKING, *TEAMS, *TRACKING_POLICIES, *TEAM_POLICIES, *installed_policies(), *ALGORITHMS]
     comments: dict[str, str] = {}
+    flag = title = ""
     if options.name in (*TRACKING, *TEAMS):
         if options.name in TEAMS:
             kind = import_module(TEAMS[options.name]).raw_env.options_type
@@ -165,15 +167,50 @@ def _list_options(options: ListOptions) -> int:
         values, flag = policy_options(options.name), "--policy-set"
         comments = policy_comments(options.name)
     else:
-        raise ValueError(unknown_name("name", options.name, names))
+        values, title = _without_options(options.name, names)
     if options.json:
         print(json.dumps(values, indent=1, default=str))
         return 0
-    print(f"options of {options.name} and their defaults; on the command line {flag} KEY=VALUE")
+    print(title or f"options of {options.name} and their defaults; on the command line {flag} KEY=VALUE")
     for name, value in values.items():
         text = comments.get(name, "")
         print(f"  {name:20} {f'{value!r:16} # {text}' if text else repr(value)}")
     return 0
+
+
+def _without_options(name: str, known: list[str]) -> tuple[dict[str, Any], str]:
+    """What is known of a vehicle, a trained policy or a suite, and a title.
+
+    Args:
+        name: Of it.
+        known: What else `list` shows, for the message.
+
+    Raises:
+        ValueError: If nothing has this name.
+    """
+    from quad_envs.vehicles import VEHICLES
+
+    from ..policies.trained import describe_shipped, shipped_policies
+    from ..sweeps.suite_files import load_suite, suite_names
+
+    if name in VEHICLES:
+        return VEHICLES[name].values(), f"values of {name}; on the command line --set vehicle={name}"
+    if name in shipped_policies():
+        said = describe_shipped(name)
+        return said, f"{name} has no options; it flies with quad-envs evaluate {said['env_id']} {name}"
+    if name in suite_names():
+        suite = load_suite(name)
+        titles: dict[str, Any] = {
+            "envs": [env.title for env in suite.envs],
+            "policies": list(dict.fromkeys(policy.contender for policy in suite.policies)),
+            "conditions": [condition.title for condition in suite.conditions],
+            "tables": [table.title for table in suite.tables],
+        }
+        numbers = {"episodes": suite.episodes, "seed": suite.seed}
+        values = {key: value for key, value in titles.items() if value} | numbers
+        return values, f"quad-envs benchmark {name} flies this"
+    every = dict.fromkeys((*known, *VEHICLES, *shipped_policies(), *suite_names()))
+    raise ValueError(unknown_name("name", name, every))
 
 
 def evaluate_one(options: EvaluateOptions) -> int:

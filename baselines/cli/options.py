@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeAlias, TypeVar, get_args, get_type_hints
@@ -13,11 +13,25 @@ from .values import read_value
 Options = TypeVar("Options")
 
 
+def _whole(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be a whole number, got {text[:80]!r}") from None
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be a number, got {text[:80]!r}") from None
+
+
 # What an option is read as; the others are text.
-_KINDS: dict[Any, type[Any]] = {
-    int: int,
-    int | None: int,
-    float | None: float,
+_KINDS: dict[Any, Callable[[str], Any]] = {
+    int: _whole,
+    int | None: _whole,
+    float | None: _number,
     Path: Path,
     Path | None: Path,
 }
@@ -45,7 +59,13 @@ ResultsFolder: TypeAlias = Annotated[Path, Positional("results folder of evaluat
 class ListOptions:
     """What there is: environments, policies, suites."""
 
-    name: Annotated[str, Positional("environment, policy or training algorithm, to see its options")] = ""
+    name: Annotated[
+        str,
+        Positional(
+            "environment, policy or training algorithm, to see its options; or a vehicle, a trained policy "
+            "or a suite, to see what it is"
+        ),
+    ] = ""
     json: Json = False
 
 
@@ -277,11 +297,16 @@ def add_options(parser: argparse.ArgumentParser, kind: type[Any]) -> None:
                 "metavar": _REPEATED.get(entry.name, "NAME"),
             }
         elif hint is not bool:
-            settings["metavar"] = {int: "N", float: "S", Path: "FOLDER"}.get(settings["type"], "NAME")
+            of_kind = {_whole: "N", _number: "S", Path: "FILE" if _is_file(str(text)) else "FOLDER"}
+            settings["metavar"] = of_kind.get(settings["type"], "NAME")
         if positional:
             parser.add_argument(entry.name, **settings)
         else:
             parser.add_argument(_flag(entry.name), dest=entry.name, **settings)
+
+
+def _is_file(text: str) -> bool:
+    return text.startswith("file ")
 
 
 def _flag(name: str) -> str:

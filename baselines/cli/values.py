@@ -13,6 +13,7 @@ from typing import Any
 
 _DEEPEST = 20  # brackets in brackets
 _MOST = 1_000_000  # characters
+_NOT_FINITE = ("inf", "+inf", "-inf", "nan")
 
 
 def read_value(text: str) -> Any:
@@ -37,11 +38,13 @@ def read_value(text: str) -> Any:
 
 
 def _scalar(text: str) -> Any:
-    """A JSON value or a Python literal, as .5 or (1, 2).
+    """A JSON value, a Python literal, as .5 or (1, 2), or inf.
 
     Raises:
         ValueError: If it is neither.
     """
+    if text.strip() in _NOT_FINITE:  # as `quad-envs list` shows them
+        return float(text)
     for read in (json.loads, ast.literal_eval):
         try:
             return read(text)

@@ -30,6 +30,12 @@ def shipped_policies() -> dict[str, str]:
     return {path.parent.name: _describe(path) for path in sorted(SHIPPED.glob(f"*/{_DESCRIPTION}"))}
 
 
+def describe_shipped(name: str) -> dict[str, Any]:
+    """How a shipped policy was made, and where: what its description says, without layers and features."""
+    said = json.loads((SHIPPED / name / _DESCRIPTION).read_text(encoding="utf-8"))
+    return {key: said[key] for key in ("env_id", "env_kwargs", "algorithm", "kind", "score") if key in said}
+
+
 def _describe(path: Path) -> str:
     said = json.loads(path.read_text(encoding="utf-8"))
     where = " with other ".join(filter(None, (said["env_id"], ", ".join(said.get("env_kwargs", {})))))
