@@ -7,6 +7,7 @@ import time
 
 import pytest
 
+import baselines.files
 from baselines import ResultsError, run_benchmark
 from baselines.__main__ import main as command
 from baselines.files import claimed
@@ -29,7 +30,7 @@ def without_times(rows):
 def test_what_another_is_at_is_waited_for_and_done_when_it_dies(tmp_path, monkeypatch):
     done = []
     tasks = [
-        Task(i, f"t{i}", lambda i=i: i if i in done else None, lambda i=i: done.append(i) or i)
+        Task(i, f"t{i}", lambda i=i: i if i in done else None, lambda i=i: done.append(i) or i, pytest.fail)
         for i in (0, 1)
     ]
 
@@ -48,7 +49,7 @@ def test_what_another_is_at_is_waited_for_and_done_when_it_dies(tmp_path, monkey
 
 def test_what_another_has_done_is_read(tmp_path):
     stored = iter([None, "theirs"])
-    task = Task(0, "t", lambda: next(stored), lambda: pytest.fail("done twice"))
+    task = Task(0, "t", lambda: next(stored), lambda: pytest.fail("done twice"), pytest.fail)
     assert list(share([task], tmp_path)) == [(0, "theirs")]
 
 
@@ -92,6 +93,57 @@ def test_a_block_that_fails_is_said_to_all_and_tried_again_by_the_next_run(tmp_p
         assert join_sweep(tmp_path) == (2, ("RuntimeError: no luck",))
     monkeypatch.setattr(crews, "fly_unit", real)
     assert not run_benchmark(SUITE, tmp_path, engine="folder").failures
+
+
+@pytest.mark.parametrize("deaths", [shared._MOST_DEATHS - 1, shared._MOST_DEATHS])
+def test_a_task_at_which_process_after_process_died_is_given_up(tmp_path, deaths):
+    count = tmp_path / "claims/t.begun"
+    baselines.files.write_json(count, deaths)  # as processes leave it that are killed
+    began = []
+    task = Task(0, "t", lambda: None, lambda: began.append(count.read_text()) or "done", lambda why: why)
+    ((_, found),) = share([task], tmp_path)
+    assert found == "done" if deaths < shared._MOST_DEATHS else "3 processes died at it" in found
+    assert len(began) == (deaths < shared._MOST_DEATHS) and not count.exists()
+
+
+DEADLY = """
+import os, signal
+import numpy as np
+
+calls = 0
+
+class Deadly:
+    def __init__(self, task):
+        pass
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        global calls
+        calls += 1
+        if calls > 60:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return np.zeros((*observation.shape[:-1], 4), np.float32), state
+"""
+
+
+@pytest.mark.slow  # starts processes that import everything
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no such signal here")
+def test_a_policy_that_kills_its_processes_is_a_failure_in_the_end_and_tried_by_the_next_run(tmp_path):
+    (tmp_path / "deadly.py").write_text(DEADLY)
+    suite = SUITE | {"policies": ["hover", "deadly:Deadly"]}
+    code = (
+        "import sys; sys.path.insert(0, '.')\nfrom baselines import run_benchmark\n"
+        f"print(run_benchmark({suite!r}, 'out', engine='folder').failures)"
+    )
+
+    def run():
+        return subprocess.run(
+            [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+
+    runs = [run() for _ in range(shared._MOST_DEATHS + 2)]
+    died = [-signal.SIGKILL] * shared._MOST_DEATHS
+    assert [each.returncode for each in runs] == [*died, 0, -signal.SIGKILL]
+    assert "3 processes died at it" in runs[-2].stdout and (tmp_path / "out/report.html").exists()
 
 
 @pytest.mark.slow  # starts processes that import everything

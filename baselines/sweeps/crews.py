@@ -111,7 +111,13 @@ class Shared:
         for unit in units:
             path = self._folder / CLAIMS / f"{unit.folder.name}.json"
             tasks.append(
-                Task(unit.number, unit.folder.name, partial(_read, path), partial(_train, unit, path))
+                Task(
+                    unit.number,
+                    unit.folder.name,
+                    partial(_read, path),
+                    partial(_train, unit, path),
+                    partial(_not_trained, path),
+                )
             )
         return share(tasks, self._folder)
 
@@ -127,6 +133,7 @@ class Shared:
                 self._store.name_of(*block),
                 partial(self._store.outcome, *block),
                 partial(self._fly, block),
+                partial(self._not_flown, block),
             )
             for i, block in enumerate(blocks)
         ]
@@ -135,9 +142,11 @@ class Shared:
 
     def _fly(self, block: Block) -> Evaluation | str:
         found = _kept(self._store, block, tried(fly_unit, block.part))
-        if isinstance(found, str):
-            self._store.fail(*block, found)
-        return found
+        return self._not_flown(block, found) if isinstance(found, str) else found
+
+    def _not_flown(self, block: Block, why: str) -> str:
+        self._store.fail(*block, why)
+        return why
 
 
 def quick_first(blocks: Sequence[Block]) -> list[Block]:
@@ -174,3 +183,8 @@ def _train(unit: TrainingUnit, path: Path) -> dict[str, Any]:
     found = tried(train_unit, unit)
     write_json(path, found)
     return found
+
+
+def _not_trained(path: Path, why: str) -> dict[str, Any]:
+    write_json(path, {"failure": why})
+    return {"failure": why}
