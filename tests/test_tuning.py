@@ -117,7 +117,8 @@ def test_what_is_tuned_follows_from_the_options_and_the_task():
 def test_every_point_of_a_search_is_an_option_that_is_allowed(name, env_id):
     limits = {"tilt_limit": 0.5} if env_id == HELIX else {}
     task, rng = task_of(env_id, **limits), np.random.default_rng(0)
-    search = make_search("nmpc", task, {"objective": "score", "reject_disturbance": True}, [name])
+    acting = {"objective": "score", "reject_disturbance": True, "disturbance_correlation_time": 1.0}
+    search = make_search("nmpc", task, acting, [name])
     for z in rng.uniform(-3.0, 3.0, (20, search.size)):
         NmpcOptions(**search.options(z))
         make_policy("nmpc", task, **search.options(z))

@@ -91,6 +91,11 @@ def _follows_noise(task: AnyTask, options: Mapping[str, Any]) -> bool:
     return _estimates(task, options) and options["estimator_gain"] == "auto"
 
 
+def _fades(task: AnyTask, options: Mapping[str, Any]) -> bool:
+    """Whether a plan expects an estimated disturbance to fade."""
+    return _estimates(task, options) and bool(np.isfinite(options["disturbance_correlation_time"]))
+
+
 def _own_gain(task: AnyTask, options: Mapping[str, Any]) -> bool:
     return bool(options["estimator_gain"] != "auto")
 
@@ -118,6 +123,12 @@ KNOBS: dict[str, Knob] = {
     "estimator_gain": Knob(1, _share, _estimates, "--policy-set reject_disturbance=true", _own_gain),
     "estimator_gain_scale": Knob(
         1, _positive, _follows_noise, '--policy-set reject_disturbance=true, and estimator_gain "auto"'
+    ),
+    "disturbance_correlation_time": Knob(
+        1,
+        _positive,
+        _fades,
+        "--policy-set reject_disturbance=true, and a finite disturbance_correlation_time",
     ),
     "floor": Knob(1, _floor, _for_score, "--policy-set objective=score"),
     "horizon": Knob(1, _samples, usual=_never),

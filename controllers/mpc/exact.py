@@ -16,6 +16,7 @@ from quad_envs.rotations import sincos, wrap_angle_scalar
 from quad_envs.tasks import Task
 
 from ..controller import first_non_finite
+from ..disturbance import N_DISTURBANCE
 from ..fallback import RELAXED
 from ..model import RK4_SCRATCH, rk4_sensitivities
 from ..qp.linalg import copy, fill
@@ -99,15 +100,19 @@ def begin_passes(floor: float, plan: Array, kept: Array, heading: bool, s: Scrat
 
 @kernel
 def linearise_model(data: MpcData, s: Scratch) -> None:
-    """A_i, B_i and c_i about the guess."""
-    point, x_next = s.square[9, 0], s.square[9, 1]
+    """A_i, B_i and c_i about the guess, under what is left of the disturbance at each stage."""
+    point, x_next, d = s.square[9, 0], s.square[9, 1], s.square[9, 2, :N_DISTURBANCE]
+    left = 1.0
     scratch = s.square.reshape(-1)[:_RK4].reshape(RK4_SCRATCH, N_STATE + N_INPUT)
     for i in range(s.F.shape[0]):
         copy_vector(s.X[i], point)
         point[7] = min(max(point[7], -_PITCH_LIMIT), _PITCH_LIMIT)
         copy_vector(point, s.points[i])
+        for a in range(N_DISTURBANCE):
+            d[a] = s.d[a] - (1.0 - left) * s.fading[a]
+        left *= data.fade
         rk4_sensitivities(
-            point, s.F[i], s.d, data.coefficients, data.B_c, data.dt, x_next, s.A[i], s.B[i], scratch
+            point, s.F[i], d, data.coefficients, data.B_c, data.dt, x_next, s.A[i], s.B[i], scratch
         )
         for a in range(N_STATE):
             total = x_next[a]

@@ -27,6 +27,7 @@ from ..qp.riccati import DARE_SCRATCH
 from ..qp.structured import solve_qp
 from ..qp.working_set import pack_working_set, unpack_working_set
 from ..qp.workspace import Workspace
+from .equilibrium import EQUILIBRIUM, spread_equilibrium
 from .present_axes import body_outputs
 
 MEMORY_STAGE = N_INPUT + 1  # numbers that a plan and its working set take per stage
@@ -56,6 +57,7 @@ class MpcData(NamedTuple):
     rate_step: float
     lag: float  # of slow rotors, s, see `frame.rotor_lag`
     gain: Annotated[Array, "6"]  # of the disturbance estimator, 0 for none
+    fade: float  # factor of its estimate from stage to stage, 1: it stays
     heading: bool  # whether the problem is posed at the present position and heading
     attitude: bool  # whether v_ref is turned into the present body axes
     level: bool  # whether the model's velocity stands in level axes, as v_ref, instead of in body axes
@@ -73,13 +75,15 @@ class Scratch(NamedTuple):
     """One sample's problem and the memory to make it."""
 
     x_0: Annotated[Array, "12"]
-    trim: Annotated[Array, "12"]  # equilibrium under the disturbance
+    trim: Annotated[Array, "12"]  # equilibrium under the disturbance, of what is left of it at the plan's end
     offset: Annotated[Array, "4"]  # equilibrium rotor forces; u = F - offset
     lower: Annotated[Array, "4"]  # of u
     upper: Annotated[Array, "4"]
     u_last: Annotated[Array, "4"]
     d: Annotated[Array, "6"]  # disturbance in the axes of the problem
     estimate: Annotated[Array, "6"]  # of what is not revealed
+    fading: Annotated[Array, "6"]  # the same in the axes of the problem
+    stages: Annotated[Array, "N, EQUILIBRIUM"]  # equilibrium of each stage, see `equilibrium`
     r: Annotated[Array, "N+1, 12"]
     c: Annotated[Array, "N, 12"]
     A: Annotated[Array, "1 or N, 12, 12"]
@@ -108,7 +112,8 @@ def make_scratch(N: int, pairs: int, H: int, K: int, M: int) -> Scratch:
     n, m, e = N_STATE, N_INPUT, N_DISTURBANCE
     shapes: dict[str, tuple[int, ...]] = {
         "x_0": (n,), "trim": (n,), "offset": (m,), "lower": (m,), "upper": (m,), "u_last": (m,),
-        "d": (e,), "estimate": (e,), "r": (N + 1, n), "c": (N, n), "A": (pairs, n, n), "B": (pairs, n, m),
+        "d": (e,), "estimate": (e,), "fading": (e,), "stages": (N, EQUILIBRIUM), "r": (N + 1, n), "c": (N, n),
+        "A": (pairs, n, n), "B": (pairs, n, m),
         "normals": (H, n), "row_lower": (K,), "row_upper": (K,), "weight": (K,), "A_c": (n, n), "P": (n, n),
         "square": (DARE_SCRATCH, n, n), "work": (ESTIMATOR_SCRATCH,), "working": (N,), "Q": (M, n, n),
         "R": (M, m, m), "target": (M + 1, n), "X": (M + 1, n), "F": (M, m), "points": (pairs, n),
@@ -153,11 +158,18 @@ def begin_row(
     for i in range(N_DISTURBANCE):
         s.d[i] = revealed[i] + s.estimate[i]
     feed_forward(s.d, plant[8], data.coefficients, data.force_max, s.offset, s.trim)
+    copy_vector(s.estimate, s.fading)
     if data.heading:
         sine, cosine = sincos(plant[8])
         s.d[3], s.d[4] = cosine * s.d[3] + sine * s.d[4], cosine * s.d[4] - sine * s.d[3]
+        x, y = s.fading[3], s.fading[4]
+        s.fading[3], s.fading[4] = cosine * x + sine * y, cosine * y - sine * x
     set_state(plant, data.heading, s.x_0)
     add_rotor_lag(plant, s.offset, data.B_c, data.lag, s.x_0)
+    spread_equilibrium(
+        revealed, s.estimate, data.fade, plant[8], data.coefficients, data.force_max, s.offset, s.trim,
+        s.stages, s.square[0],
+    )  # fmt: skip
     if data.level:
         level_velocity(s.x_0)
     set_references(plant, window, s.trim, data.heading, data.attitude, data.kinematics, N + 1, data.dt, s.r)
@@ -173,21 +185,6 @@ def begin_row(
         turn_rows(plant, data.axis, data.normal, s.normals, s.row_lower, s.row_upper)
     if data.level or data.present:
         body_outputs(plant, data.level, data.normal, s.normals, s.row_lower, s.row_upper)
-
-
-@kernel
-def hold_trim(A: Array, trim: Array, c: Array) -> None:
-    """c_i = trim - A_i trim, so that the equilibrium stays one in the model; zero without a lateral force.
-
-    Args:
-        A: (1 or N, 12, 12).
-        trim: (12,), of which only roll and pitch are not zero.
-        c: Result, (N, 12).
-    """
-    for i in range(c.shape[0]):
-        j = i if A.shape[0] > 1 else 0
-        for a in range(N_STATE):
-            c[i, a] = trim[a] - A[j, a, 6] * trim[6] - A[j, a, 7] * trim[7]
 
 
 @kernel

@@ -15,12 +15,12 @@ from ..controller import first_non_finite
 from ..model import hover_pair
 from ..qp.ocp import IntArray
 from ..qp.workspace import Workspace
+from .equilibrium import hold_equilibrium
 from .kernels import (
     MpcData,
     Scratch,
     begin_row,
     end_row,
-    hold_trim,
     left_model,
 )
 from .linear_score import begin_guess, refuses_plan, solve_for_objective, weigh_about_guess
@@ -65,7 +65,7 @@ def _decide_rows(
         return bad
     for j in range(plants.shape[0]):
         begin_row(plants[j], windows[j], lasts[j], disturbances[j], memories[j], which, data, s)
-        hold_trim(A, s.trim, s.c)
+        hold_equilibrium(A, B, data.fade < 1.0, s.stages, s.c)
         begin_guess(floor, memories[j], s)
         has_plan = memories[j, 0] > 0.0
         level, iterations = solve_for_objective(A, B, data.P, stationary, has_plan, data, s, ws)
@@ -111,7 +111,7 @@ class LinearMPC(Mpc):
     def _pose(self, number: int, memory: Array, s: Scratch, ws: Workspace) -> Problem:
         data = self._data
         if number == 0:
-            hold_trim(self._A, s.trim, s.c)
+            hold_equilibrium(self._A, self._B, self._data.fade < 1.0, s.stages, s.c)
             begin_guess(self._floor, memory, s)
         if s.floor[0] < COST_FLOOR:
             weigh_about_guess(self._A, self._B, data.P, data, s)

@@ -151,6 +151,7 @@ def mpc_data(task: BaseTask, options: MpcOptions, axes: VelocityAxes) -> MpcData
         rate_step=float(task.limits.rate * task.dt),
         lag=rotor_lag(task),
         gain=estimator_gain(task, options),
+        fade=math.exp(-task.dt / options.disturbance_correlation_time),
         heading=heading,
         attitude=heading and axes in ("attitude", "present"),
         level=heading and axes == "level",

@@ -116,6 +116,10 @@ class VehicleMpcOptions(ProblemOptions):
         # "auto" takes it from `task.sensor_noise`, 0.5 without any
     )
     estimator_gain_scale: float = 1.0  # factor on the gain that "auto" takes; no gain exceeds 1
+    disturbance_correlation_time: float = (
+        math.inf  # s, in which a plan expects the estimated disturbance to fade to 1/e, 1 s for `Gusts`;
+        # inf: it stays, and a steady one leaves no offset (offset-free MPC)
+    )
     iteration_limit: int = ITERATION_LIMIT  # active-set steps of a solve at most; 0: one that grows with it
 
     def __post_init__(self) -> None:
@@ -135,6 +139,11 @@ class VehicleMpcOptions(ProblemOptions):
                 f"estimator_gain_scale={self.estimator_gain_scale} scales what estimator_gain='auto' "
                 f"takes, and estimator_gain is {self.estimator_gain}: give the product as estimator_gain, or "
                 "leave that at 'auto'"
+            )
+        if not self.disturbance_correlation_time > 0.0:
+            raise ValueError(
+                "disturbance_correlation_time must be > 0 s (math.inf: the disturbance stays), got "
+                f"{shown(self.disturbance_correlation_time)}"
             )
         require_whole(
             "iteration_limit (0: one that grows with the problem)", self.iteration_limit, 0, MOST_ITERATIONS

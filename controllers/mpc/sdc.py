@@ -16,6 +16,7 @@ from ..qp.linalg import copy
 from ..qp.ocp import IntArray
 from ..qp.riccati import solve_dare
 from ..qp.workspace import Workspace
+from .equilibrium import hold_equilibrium
 from .kernels import (
     FROZEN_SPAN,
     MpcData,
@@ -23,7 +24,6 @@ from .kernels import (
     begin_row,
     copy_vector,
     end_row,
-    hold_trim,
     left_model,
 )
 from .linear_score import begin_guess, guess_plan, refuses_plan, solve_for_objective, weigh_about_guess
@@ -71,7 +71,7 @@ def freeze_model(alpha: float, present: bool, sdre_weight: bool, data: MpcData, 
         stop_turning(s.A_c)
     zero_order_hold(s.A_c, data.B_c, data.dt, s.A[0], s.B[0], s.square)
     copy_vector(s.x_0, s.points[0])
-    hold_trim(s.A[:1], s.trim, s.c)
+    hold_equilibrium(s.A[:1], s.B[:1], data.fade < 1.0, s.stages, s.c)
     for i in range(0 if present else s.c.shape[0]):
         hold_heading(s.r[i], s.x_0, s.A_c, data.dt, s.c[i])
     if sdre_weight and solve_dare(s.A[0], s.B[0], data.Q[0], data.R[0], s.P, s.square) > 0:
@@ -101,7 +101,8 @@ def relinearise(u: Array, alpha: float, present: bool, data: MpcData, s: Scratch
             pair_in_present_axes(R, data.B_c, s.A_c, B_c, work)
         x[8] = yaw
         zero_order_hold(s.A_c, B_c, data.dt, s.A[i], s.B[i], s.square)
-        hold_trim(s.A[i : i + 1], s.trim, s.c[i : i + 1])
+        k = slice(i, i + 1)
+        hold_equilibrium(s.A[k], s.B[k], data.fade < 1.0, s.stages[k], s.c[k])
         if not present:
             hold_heading(s.r[i], x, s.A_c, data.dt, s.c[i])
         for a in range(N_STATE):

@@ -14,13 +14,13 @@ from quad_envs.rotations import sincos
 from ..controller import all_finite
 from ..fallback import HOVER, PREVIOUS_PLAN
 from ..model import sdc_matrix, zero_order_hold
+from ..mpc.equilibrium import hold_equilibrium
 from ..mpc.kernels import (
     MpcData,
     Scratch,
     begin_row,
     copy_vector,
     end_row,
-    hold_trim,
     left_model,
     solve_row,
 )
@@ -154,7 +154,7 @@ def pose_row(
             s.A_c[a, 6 + b] += D[a, b]
     zero_order_hold(s.A_c, data.B_c, data.dt, s.A[0], s.B[0], s.square)
     copy_vector(s.x_0, s.points[0])
-    hold_trim(s.A, s.trim, s.c)
+    hold_equilibrium(s.A, s.B, data.fade < 1.0, s.stages, s.c)
     hold_attitude(s.x_0, D, data.dt, s.c)
     if layout.stage_weight:
         copy(data.Q[0], s.P)
