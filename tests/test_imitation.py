@@ -8,6 +8,7 @@ import pytest
 from baselines import evaluate, make_policy, train
 from baselines.policies.environments import make_env, task_of
 from baselines.policies.network import Network
+from baselines.training import imitation
 from baselines.training.held_out import CHOOSING, HELD_OUT, training_options
 from baselines.training.imitation import DaggerOptions, LabelledFlights, Labels, make_expert
 from baselines.training.imitation import train as dagger
@@ -246,6 +247,20 @@ def test_what_dagger_cannot_do_is_refused_before_anything_is_written(tmp_path, e
     with pytest.raises(ValueError, match=message):
         train(env_id, "dagger", steps=1, out=tmp_path, **given)
     assert not (tmp_path / "config.json").exists()
+
+
+@pytest.mark.parametrize("flown_by_expert", [0.2, 1e-9])
+def test_an_expert_that_answers_nan_is_named(monkeypatch, flown_by_expert):
+    class Silent:
+        name = "silent"
+
+        def predict(self, observation, state=None, episode_start=None, deterministic=True):
+            return np.full((len(observation), 4), np.nan, dtype=np.float32), state
+
+    monkeypatch.setattr(imitation, "make_expert", lambda *_, **__: Silent())
+    options = DaggerOptions(expert="lqr", expert_flies=flown_by_expert)
+    with pytest.raises(ValueError, match=r"the expert 'silent' answers with actions that are not finite"):
+        list(dagger(training_options(HELIX, {}), options, 0, lambda: 0.5))
 
 
 def test_a_network_with_other_layers_is_no_start():

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
+from quad_envs import target_tracking_v0
 from quad_envs.references import Helix, RandomSmooth
 from quad_envs.targets import (
     Aircraft,
@@ -201,3 +202,9 @@ def test_make_target_returns_a_target_as_it_is():
 def test_a_broken_target_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_a_target_that_jumps_is_refused():
+    columns = {"t": [0.0, 0.5, 1.0], "x": [0.0, 1e9, 0.0], "y": [0.0] * 3, "z": [0.0] * 3}
+    with pytest.raises(ValueError, match=r"moves at 2e\+09 m/s at t = 0 s; no target moves faster"):
+        target_tracking_v0.parallel_env(target=columns, time_limit=1.0)

@@ -4,7 +4,7 @@ import pytest
 
 pytest.importorskip("stable_baselines3")
 
-from baselines import CheckpointError, train
+from baselines import CheckpointError, make_policy, train
 
 HELIX = "quad/HelixTracking-v0"
 
@@ -43,3 +43,11 @@ def test_a_tuned_folder_is_no_network_to_begin_with(tmp_path):
     with pytest.raises(CheckpointError, match="is a tuned policy, which has no network to begin with"):
         train(HELIX, "apg", steps=1, out=tmp_path / "run", start_from=tmp_path / "tuned")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_whose_training_has_saved_nothing_says_so(tmp_path):
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(CheckpointError, match=r"cannot read policy\.json.*has not saved a policy yet"):
+        make_policy(tmp_path, HELIX)
+    with pytest.raises(CheckpointError, match="has not saved a policy yet"):
+        train(HELIX, "apg", steps=1, out=tmp_path / "run", start_from=tmp_path)

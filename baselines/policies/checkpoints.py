@@ -193,9 +193,11 @@ def _read(file: Path, where: str) -> bytes:
                 raise CheckpointError(f"{where}: {file.name} is no regular file")
             data = stream.read(_LARGEST + 1)
     except OSError as error:
+        remedy = f"a checkpoint is a folder with {WEIGHTS} and {DESCRIPTION}"
+        if (file.parent / "config.json").exists() and not file.exists():
+            remedy = "a training there has not saved a policy yet, if there is one: wait, or run it again"
         raise CheckpointError(
-            f"{where}: cannot read {file.name}: {error.strerror or error}; a checkpoint is a folder with "
-            f"{WEIGHTS} and {DESCRIPTION}"
+            f"{where}: cannot read {file.name}: {error.strerror or error}; {remedy}"
         ) from error
     if len(data) > _LARGEST:
         raise CheckpointError(

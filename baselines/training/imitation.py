@@ -26,7 +26,7 @@ from ..evaluation.rollout import is_privileged
 from ..policies.network import Floats, Network
 from ..policies.network_policies import network_policy
 from ..policies.protocol import Policy
-from ..policies.registry import is_trained, make_policy, policy_options
+from ..policies.registry import is_trained, make_policy, policy_name, policy_options
 from .algorithm_options import DaggerOptions
 from .beginning import require_continuable
 from .features import require_measured, training_features
@@ -101,6 +101,11 @@ class LabelledFlights:
         seen, wanted, rewards = [], [], []
         for _ in range(steps):
             labels, self._state = self._expert.predict(self._observations, self._state, self._begins)
+            if not np.isfinite(labels).all():
+                raise ValueError(
+                    f"the expert {policy_name(self._expert)!r} answers with actions that are not finite, "
+                    "which nobody can imitate: choose another one (--hyper expert=sdc-nmpc)"
+                )
             own, self._flown = flier.predict(self._observations, self._flown, self._begins)
             actions = np.where(by_expert, labels, own)
             flies = ~self._done  # a row that is done begins anew in this step, whatever the action

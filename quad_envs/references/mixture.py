@@ -22,7 +22,7 @@ from .trajectories import (
     pack_rows,
 )
 
-_WEIGHT = Bound(0.0, 1e6, "-", "only their ratios count")
+_WEIGHT = Bound(0.0, 1e6, "", "only their ratios count")
 _OFFSET = Bound(0.0, 1e3, "m", "a vehicle that starts farther away is lost")
 _SHARE = Bound(0.0, 1.0)
 _TURNING = 0.4  # rad/s, fastest heading

@@ -7,6 +7,7 @@ import numpy as np
 from ..parameters import Array
 
 FASTEST = 100.0  # m/s; the fastest multicopters of 2020 reach it
+_FASTEST_TARGET = 1e4  # m/s; nothing near the ground is faster
 _WINDOW = 0.5  # s, over which a displacement is compared with velocities; rounded positions are noisy
 _RELATIVE, _ABSOLUTE = 0.2, 0.05  # of the displacement; m/s, noise of measured velocities
 _SHARE = 0.25  # of the windows; a step of a set point contradicts in one
@@ -43,13 +44,18 @@ def points_up(p: Array) -> str:
     )
 
 
-def too_fast(v: Array, times: Array) -> str:
+def target_too_fast(v: Array, times: Array) -> str:
+    """As `too_fast`, of a target, which may be faster than who follows it."""
+    return too_fast(v, times, _FASTEST_TARGET, "target moves")
+
+
+def too_fast(v: Array, times: Array, fastest: float = FASTEST, who: str = "quadrotor flies") -> str:
     """Said of velocities (n, 3) at times (n,) that no vehicle flies; empty if there are none."""
     speed = np.linalg.norm(v, axis=1)
-    k = int(np.argmax(speed > FASTEST))
-    if not speed[k] > FASTEST:
+    k = int(np.argmax(speed > fastest))
+    if not speed[k] > fastest:
         return ""
     return (
-        f"moves at {speed[k]:.4g} m/s at t = {times[k]:g} s; no quadrotor flies faster than {FASTEST:g} m/s: "
+        f"moves at {speed[k]:.4g} m/s at t = {times[k]:g} s; no {who} faster than {fastest:g} m/s: "
         "look at its units, and for a jump or a lost row"
     )

@@ -33,6 +33,7 @@ from ...lanes import (
 from ...observations.tracking import N_REFERENCE, tabulate_previews
 from ...plant import N_STATE, Array
 from ...references import make_reference, pack_rows
+from ...references.plausible import target_too_fast
 from ...references.table_row import N_PREVIEW, N_TABLE
 from ...sensors import sensor_rows
 from ...targets import N_TARGET, make_target
@@ -366,6 +367,9 @@ class TeamBatch(PackedBatch):
         assert self._target is not None
         times = self._times[: self.task.episode_steps + 1]
         rows = checked_rows("target", self._target, self._target.rows(times, rng), times, N_TARGET)
+        said = target_too_fast(rows[:, 3:6], times)
+        if said:
+            raise ValueError(f"target {shown(self._target)} {said}")
         if max(self._spread) > 0.0:
             offset = np.repeat(np.asarray(self._spread), 3) * rng.standard_normal(N_TARGET)
             rows = rows + offset
