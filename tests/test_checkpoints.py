@@ -312,6 +312,11 @@ def test_a_network_that_sees_what_is_not_there_is_refused(saved):
         make_policy(saved, make_env(HELIX, preview=10))
 
 
+def test_a_shipped_network_that_does_not_fit_says_where_it_was_trained():
+    with pytest.raises(CheckpointError, match=r"trained on 'quad/CorridorTracking-v0', does not fit"):
+        make_policy("ppo-corridor", HELIX)
+
+
 def test_a_network_with_other_actions_is_refused(tmp_path):
     save_checkpoint(tmp_path / "wide", network_for(outputs=6), ABOUT)
     with pytest.raises(CheckpointError, match="gives 6 numbers, an action of this task has 4"):

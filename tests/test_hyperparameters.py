@@ -11,7 +11,7 @@ from baselines import ResultsError, train
 from baselines.__main__ import main
 from baselines.policies.checkpoints import load_checkpoint
 from baselines.policies.trained import SHIPPED
-from baselines.training.algorithm_options import PpoOptions, SacOptions
+from baselines.training.algorithm_options import PpoOptions, SacOptions, check_sizes
 from baselines.training.algorithms import ALGORITHMS, options_of
 from baselines.training.former_names import _TODAY, name_of_today
 from baselines.training.hyperparameters import hyperparameters, recorded_hyperparameters
@@ -197,3 +197,9 @@ def test_comments_are_empty_where_there_is_no_source():
     found = {}
     exec("from dataclasses import dataclass\n@dataclass\nclass Made:\n    a: int = 1  # one\n", found)
     assert field_comments(found["Made"]) == {"a": ""}
+
+
+@pytest.mark.parametrize("algorithm", ["apg", "dagger"])
+def test_a_learning_rate_that_climbs_is_refused_before_anything_is_made(algorithm):
+    with pytest.raises(ValueError, match=r"hyperparameter learning_rate must be a number > 0, got -1\.0"):
+        check_sizes(hyperparameters(algorithm, "", {"learning_rate": -1}), 226)

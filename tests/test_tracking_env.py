@@ -402,3 +402,21 @@ def test_kernels_run_as_plain_python_for_debugging():
     )
     compiled, plain = printed_compiled_and_plain(code)
     assert float(compiled) == pytest.approx(float(plain), rel=1e-6)
+
+
+@pytest.mark.parametrize("action", ["abc", ["a"] * 4, {"rotor": 1.0}])
+def test_an_action_that_is_no_number_is_refused_as_an_action(action):
+    env = gym.make("quad/HelixTracking-v0").unwrapped
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="action must be 4 numbers, one per rotor, got"):
+        env.step(action)
+
+
+def test_reset_options_that_are_no_mapping_are_refused_by_name():
+    with pytest.raises(ValueError, match=r"reset options must be a mapping, .* got 3"):
+        gym.make("quad/HelixTracking-v0").unwrapped.reset(options=3)
+
+
+def test_an_unknown_autoreset_mode_is_refused_with_those_that_there_are():
+    with pytest.raises(ValueError, match="unknown autoreset_mode 'SameStp'; did you mean 'SameStep'"):
+        gym.make_vec("quad/HelixTracking-v0", num_envs=2, autoreset_mode="SameStp")

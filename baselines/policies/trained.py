@@ -132,7 +132,8 @@ def load_policy(source: str | os.PathLike[str], env: Any) -> NetworkPolicy | Est
     try:
         return network_policy(network, task, name, str(said.get("kind", "")))
     except ValueError as error:
-        raise CheckpointError(f"{where} does not fit {task.env_id}: {error}") from error
+        made = f", trained on {shown(said['env_id'])}," if "env_id" in said else ""
+        raise CheckpointError(f"{where}{made} does not fit {task.env_id}: {error}") from error
 
 
 def _require_sensor(where: str, said: Mapping[str, Any], task: TeamTask) -> None:

@@ -175,7 +175,7 @@ class SacOptions:
 
 
 def check_sizes(options: Any, width: int) -> None:
-    """Refuse sizes that no machine holds, before anything is made.
+    """Refuse sizes that no machine holds, and steps that do not descend, before anything is made.
 
     Args:
         options: Hyperparameters of any algorithm.
@@ -189,6 +189,10 @@ def check_sizes(options: Any, width: int) -> None:
         if value is not None and one.name in _MOST:
             least, most = int(one.name not in _MAY_BE_NONE), _MOST[one.name]
             require_whole(f"hyperparameter {one.name}", value, least, most, lambda n: 4 * n * width)
+    for name in ("learning_rate", "max_grad_norm"):
+        value = getattr(options, name, 1.0)
+        if not value > 0.0:
+            raise ValueError(f"hyperparameter {name} must be a number > 0, got {shown(value)}")
     for name in ("net_arch", "critic_arch"):
         layers = getattr(options, name, ())
         if len(layers) > _MOST_LAYERS:

@@ -6,7 +6,10 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
+
+from ...arguments.names import unknown_name
 
 Generators = list[np.random.Generator]
 
@@ -45,3 +48,15 @@ def presence(n: int, names: Iterable[str]) -> dict[str, NDArray[np.bool_]]:
     mask = np.ones(n, dtype=np.bool_)
     mask.flags.writeable = False
     return {f"_{name}": mask for name in names}
+
+
+def autoreset_of(mode: AutoresetMode | str) -> AutoresetMode:
+    """When flights of a vector begin anew, of its name in Gymnasium.
+
+    Raises:
+        ValueError: If there is no such mode.
+    """
+    known = [one.value for one in AutoresetMode]
+    if not isinstance(mode, AutoresetMode) and mode not in known:
+        raise ValueError(unknown_name("autoreset_mode", mode, known))
+    return AutoresetMode(mode)

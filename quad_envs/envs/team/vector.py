@@ -16,7 +16,7 @@ from ...arguments.checks import require_whole
 from ...lanes import N_PLANT, PLANT
 from ...plant import Array
 from ...tasks import TeamTask
-from ..shared.vector_parts import Generators, presence, seeded
+from ..shared.vector_parts import Generators, autoreset_of, presence, seeded
 from .batch import TeamBatch
 from .options import TeamOptions
 from .told import TeamScores
@@ -54,7 +54,7 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
     ) -> None:
         require_whole("num_teams", num_teams, 1)
         require_whole("threads", threads, 1)
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.autoreset_mode = autoreset_of(autoreset_mode)
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
             raise ValueError("autoreset_mode must be NEXT_STEP or DISABLED for teams")
         self._batch = TeamBatch(options, int(num_teams), int(threads))

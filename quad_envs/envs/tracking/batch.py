@@ -264,9 +264,11 @@ class TrackingBatch(PackedBatch):
         Raises:
             ValueError: If an option is unknown, or the state is not a finite plant.
         """
+        if not isinstance(options, Mapping | None):
+            raise ValueError(f"reset options must be a mapping, as {{'state': [...]}}, got {shown(options)}")
         if not options:
             return None
-        unknown = sorted(set(options) - {"state"})
+        unknown = [name for name in options if name != "state"]
         if unknown:
-            raise ValueError(f"unknown reset option {unknown[0]!r}; known: 'state' (12 or 16 numbers)")
+            raise ValueError(f"unknown reset option {shown(unknown[0])}; known: 'state' (12 or 16 numbers)")
         return given_plants(options["state"], (), self.task.hover_force)

@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from ...arguments.names import shown
 from ...episode_limit import steps_asked
 from ...lanes import N_PLANT, PLANT
 from ...plant import Array
@@ -168,7 +169,10 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
         """Hold the rotor commands over one control period."""
         if self._np_random is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        actions = np.ascontiguousarray(action, FLOAT32)
+        try:
+            actions = np.ascontiguousarray(action, FLOAT32)
+        except (TypeError, ValueError):
+            raise ValueError(f"action must be 4 numbers, one per rotor, got {shown(action)}") from None
         if actions.shape != (4,):
             raise ValueError(f"action must have shape (4,), one entry per rotor, got {actions.shape}")
         observation = np.empty(self._size, FLOAT32)

@@ -21,7 +21,7 @@ from ..shared.actions import FLOAT32
 from ..shared.given import as_numbers, given_plants
 from ..shared.render_modes import NO_RENDERING, checked_rendering
 from ..shared.specified import Specified
-from ..shared.vector_parts import Generators, seeded
+from ..shared.vector_parts import Generators, autoreset_of, seeded
 from .batch import TrackingBatch
 from .options import TrackingOptions
 from .scores import answer_of, blank_info
@@ -67,7 +67,7 @@ class TrackingVectorEnv(
         size = checked_rendering(render_mode, ("rgb_array",), render_size)
         options = TrackingOptions.from_kwargs(kwargs)
         self.num_envs, self.render_mode = num_envs, render_mode
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.autoreset_mode = autoreset_of(autoreset_mode)
         self.metadata = {
             "render_modes": ["rgb_array"],
             "render_fps": 20,
