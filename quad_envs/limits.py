@@ -178,9 +178,9 @@ class LimitOptions:
     tilt_limit: float = math.inf  # rad, |roll| and |pitch|
     velocity_limit: float = math.inf  # m/s, each component of the body velocity
     position_limit: tuple[_Triple, _Triple] | None = None  # m, NED: ((x, y, z) lower, (x, y, z) upper)
-    # rad/s, |p|, |q| and |r|. An MPC does not model the 20 ms of the rotors, which these follow at once: it
-    # exceeds its own bound by up to a fifth, and a `margin` of that size keeps the limit.
-    body_rate_limit: float = math.inf
+    # An MPC does not model the 20 ms of the rotors, which body rates follow at once: it exceeds its own bound
+    # by up to a fifth, and a `margin` of that size keeps the limit.
+    body_rate_limit: float = math.inf  # rad/s, |p|, |q| and |r|
 
     def require_limits(self) -> None:
         """Check the shapes of what was given; `make_limits` checks the values.

@@ -280,6 +280,12 @@ def test_infinity_is_read_as_list_shows_it(text, value):
     assert read_value(text) == value
 
 
+def test_list_shows_what_each_option_of_a_tracking_environment_means(capsys):
+    assert main(["list", HELIX]) == 0
+    printed = [line for line in capsys.readouterr().out.splitlines()[1:] if not line.startswith("  kappa")]
+    assert len(printed) > 25 and not [line for line in printed if " # " not in line]
+
+
 @pytest.mark.parametrize(
     "name", [name for name in (*TRACKING_POLICIES, *TEAM_POLICIES) if policy_comments(name)]
 )

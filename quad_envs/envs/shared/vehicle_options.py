@@ -40,25 +40,25 @@ class VehicleOptions(LimitOptions):
     kind: ClassVar[str] = ""  # of environment, for messages
 
     env_id: str = ""
-    vehicle: str = "dissertation"
-    mass: float = 0.8
-    gravity: float = 9.8
-    inertia: Triple = (0.0224, 0.0224, 0.0436)
-    arm: float = 0.165
-    yaw_moment: float = 0.002167
-    rotor_rate: float = 50.0
-    drag: float = 0.0
-    frame: str = "plus"
-    Q: float | tuple[float, ...] = 1.0
-    R: float | tuple[float, ...] = 1.0
-    disturbance: DisturbanceLike = None
-    reveal_disturbance: bool = False
-    sensor_noise: float | tuple[float, float, float, float] = 0.0
-    randomize: float | Mapping[str, float] = 0.0
-    dt: float = DT
-    substeps: int = 5
-    time_limit: float = TIME_LIMIT
-    reward: str = "bounded"
+    vehicle: str = "dissertation"  # a name of `quad-envs list`; arguments go before its values
+    mass: float = 0.8  # kg
+    gravity: float = 9.8  # m/s^2
+    inertia: Triple = (0.0224, 0.0224, 0.0436)  # kg m^2, principal moments
+    arm: float = 0.165  # m
+    yaw_moment: float = 0.002167  # m, yaw torque of a rotor per N of its force
+    rotor_rate: float = 50.0  # 1/s, inverse of the time constant of the rotors
+    drag: float = 0.0  # kg/s
+    frame: str = "plus"  # "plus" or "x"
+    Q: float | tuple[float, ...] = 1.0  # weights of the state in the reward: a number or 12
+    R: float | tuple[float, ...] = 1.0  # weights of the forces in the reward: a number or 4
+    disturbance: DisturbanceLike = None  # a name, as "gusts", a force (x, y, z) in N, or a function of time
+    reveal_disturbance: bool = False  # whether its mean over the coming period is observed
+    sensor_noise: float | tuple[float, float, float, float] = 0.0  # sigma: m, m/s, rad, rad/s; or one
+    randomize: float | Mapping[str, float] = 0.0  # relative spread at each reset, of each or of all
+    dt: float = DT  # s, control period
+    substeps: int = 5  # of the integrator in a control period
+    time_limit: float = TIME_LIMIT  # s, or "reference": as long as that is given
+    reward: str = "bounded"  # "bounded", from 0 to 1 a step, or "quadratic"
 
     def __post_init__(self) -> None:
         vehicle_values(self.vehicle)

@@ -77,24 +77,24 @@ class TeamOptions(VehicleOptions):
 
     tilt_limit: float = 1.2
     time_limit: float = 20.0
-    max_cycles: int | None = None
+    max_cycles: int | None = None  # in place of time_limit, as in PettingZoo
     vehicles: int = 6
-    formation: str | _Rows = "lattice"
-    spacing: float = 1.0
-    graph: str | GraphLike | GraphSchedule = "weak"
+    formation: str | _Rows = "lattice"  # a name, or slots (N, 3), m
+    spacing: float = 1.0  # m, between the slots of a named formation
+    graph: str | GraphLike | GraphSchedule = "weak"  # who hears whom: a name, edges, a matrix or a schedule
     leader_weight: float = 10.0
-    drop_out: float = 0.0
-    delay: int = 0
-    message_lifetime: float = 2.0
+    drop_out: float = 0.0  # probability that a message is lost
+    delay: int = 0  # control periods that a message is under way
+    message_lifetime: float = 2.0  # s, after which a message is forgotten
     comm: Comm = "state"
     start: str | _Rows = "random"
-    separation: float = _SEPARATION
-    crash_distance: float = 0.33
-    sensing_radius: float = 2.0
+    separation: float = _SEPARATION  # m, least distance between vehicles: a limit
+    crash_distance: float = 0.33  # m, below which two crash
+    sensing_radius: float = 2.0  # m, within which others are seen, heard or not
     neighbours: int | None = None
     sensed: int | None = None
-    preview: int = 5
-    terminate: Terminate = "team"
+    preview: int = 5  # control periods of the coming reference in the observation
+    terminate: Terminate = "team"  # whom a crash ends: "team" or "agent"
     arena: float = 100.0
     formation_weight: float = 1.0
     # Made once from the rest, because a graph may come from a user's function.

@@ -29,12 +29,12 @@ class TrackingOptions(VehicleOptions):
     kind: ClassVar[str] = "a tracking"
 
     env_id: str = "quad/Tracking-v0"
-    reference: ReferenceLike = "setpoint"  # afterwards what is flown
-    start: str | tuple[float, ...] = (0.0, 0.0, 0.0)
-    start_box: float | tuple[float, ...] = 1.0
-    preview: int = 25
-    lost_distance: float = 50.0
-    max_episode_steps: int | None = None
+    reference: ReferenceLike = "setpoint"  # a name, a path, a mapping, ...; afterwards what is flown
+    start: str | tuple[float, ...] = (0.0, 0.0, 0.0)  # 3 numbers, m, or 12 (state), or "reference"
+    start_box: float | tuple[float, ...] = 1.0  # half widths about it: 1 or 3, m, or 12 (state)
+    preview: int = 25  # control periods of the coming reference in the observation
+    lost_distance: float = 50.0  # m from the reference, beyond which it is a crash
+    max_episode_steps: int | None = None  # in place of time_limit, as in gymnasium.make
     task: Task = field(init=False, repr=False, compare=False)  # made from the rest
 
     def __post_init__(self) -> None:
