@@ -11,7 +11,7 @@ from baselines import ResultsError, train
 from baselines.__main__ import main
 from baselines.policies.checkpoints import load_checkpoint
 from baselines.policies.trained import SHIPPED
-from baselines.training.algorithm_options import PpoOptions, SacOptions, check_sizes
+from baselines.training.algorithm_options import PpoOptions, SacOptions
 from baselines.training.algorithms import ALGORITHMS, options_of
 from baselines.training.former_names import _TODAY, name_of_today
 from baselines.training.hyperparameters import hyperparameters, recorded_hyperparameters
@@ -199,7 +199,22 @@ def test_comments_are_empty_where_there_is_no_source():
     assert field_comments(found["Made"]) == {"a": ""}
 
 
-@pytest.mark.parametrize("algorithm", ["apg", "dagger"])
-def test_a_learning_rate_that_climbs_is_refused_before_anything_is_made(algorithm):
-    with pytest.raises(ValueError, match=r"hyperparameter learning_rate must be a number > 0, got -1\.0"):
-        check_sizes(hyperparameters(algorithm, "", {"learning_rate": -1}), 226)
+@pytest.mark.parametrize(
+    ("algorithm", "name", "value", "message"),
+    [
+        ("apg", "learning_rate", -1, r"must be finite and > 0, got -1\.0"),
+        ("dagger", "learning_rate", -1, r"must be finite and > 0, got -1\.0"),
+        ("apg", "gamma", 2, r"must be at most 1, got 2\.0"),
+        ("apg", "final_rate", -1, r"must be finite and > 0, got -1\.0"),
+        ("apg", "epsilon", 0, r"must be finite and > 0, got 0\.0"),
+        ("apg", "penalty", -1, r"must be finite and >= 0, got -1\.0"),
+        ("apg", "net_arch", [], "needs at least one layer"),
+        ("apg", "separation", 0, "must be finite and > 0 m, got 0"),
+        ("dagger", "expert_flies", 3, r"must be at most 1, got 3\.0"),
+        ("dagger", "threshold", 0, r"must be finite and > 0, got 0\.0"),
+        ("dagger", "net_arch", [], "needs at least one layer"),
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused_by_name(algorithm, name, value, message):
+    with pytest.raises(ValueError, match=f"hyperparameter {name} {message}"):
+        hyperparameters(algorithm, "", {name: value})

@@ -442,8 +442,8 @@ def test_a_policy_with_other_layers_is_refused_as_a_start():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"n_envs": 0}, r"n_envs must be finite and positive, got 0"),
-        ({"learning_rate": float("nan")}, r"learning_rate must be finite and positive, got nan"),
+        ({"n_envs": 0}, r"n_envs must be finite and > 0, got 0"),
+        ({"learning_rate": float("nan")}, r"learning_rate must be finite and > 0, got nan"),
         ({"gamma": 1.5}, r"gamma must be at most 1, got 1.5"),
         ({"net_arch": ()}, r"net_arch needs at least one layer"),
     ],

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 _POSITIVE = (
     *("n_envs", "n_steps", "progress_steps", "batch_size", "n_epochs", "learning_rate", "final_rate"),
     *("gamma", "clip_range", "max_grad_norm", "command_range", "train_freq", "gradient_steps"),
-    *("buffer_size", "tau", "probes", "start_learning_rate"),
+    *("buffer_size", "tau", "probes", "start_learning_rate", "final_n_steps", "substeps", "epsilon"),
+    *("final_epsilon", "threshold"),
 )
 # Hyperparameters that take memory or time, and the largest that make sense.
 _MOST = {
@@ -36,8 +37,8 @@ _MOST = {
 }
 _MAY_BE_NONE = ("gradient_steps", "final_gradient_steps", "critic_updates", "learning_starts")
 _WIDEST, _MOST_LAYERS = 10_000, 20
-_SHARES = ("free", "final_rate", "gamma", "gae_lambda", "tau", "command_range")
-_WEIGHTS = ("vf_coef",)  # that may be zero
+_SHARES = ("free", "final_rate", "gamma", "gae_lambda", "tau", "command_range", "expert_flies")
+_WEIGHTS = ("vf_coef", "penalty")  # that may be zero
 _AUTO = re.compile(r"auto(_(?=[0-9.]*[1-9])[0-9]*\.?[0-9]+(e-?[0-9]+)?)?")
 
 
@@ -64,6 +65,9 @@ class PolicyGradientOptions:
     disturbance_estimate: bool = False  # whether the network sees an estimate of the disturbance
     heading_axes: bool = False  # whether it sees in axes turned to the heading of the reference
 
+    def __post_init__(self) -> None:
+        _check_numbers(self)
+
 
 @dataclass(frozen=True, slots=True)
 class DaggerOptions:
@@ -87,6 +91,9 @@ class DaggerOptions:
     heading_axes: bool = False  # whether the network sees in axes turned to the heading of the reference
     separation: float | None = None  # m, that the expert of a team keeps; None for the task's own
     episode_steps: int | None = None  # of a team's flight in training; None for the task's own
+
+    def __post_init__(self) -> None:
+        _check_numbers(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +182,7 @@ class SacOptions:
 
 
 def check_sizes(options: Any, width: int) -> None:
-    """Refuse sizes that no machine holds, and steps that do not descend, before anything is made.
+    """Refuse sizes that no machine holds, before anything is made.
 
     Args:
         options: Hyperparameters of any algorithm.
@@ -189,10 +196,6 @@ def check_sizes(options: Any, width: int) -> None:
         if value is not None and one.name in _MOST:
             least, most = int(one.name not in _MAY_BE_NONE), _MOST[one.name]
             require_whole(f"hyperparameter {one.name}", value, least, most, lambda n: 4 * n * width)
-    for name in ("learning_rate", "max_grad_norm"):
-        value = getattr(options, name, 1.0)
-        if not value > 0.0:
-            raise ValueError(f"hyperparameter {name} must be a number > 0, got {shown(value)}")
     for name in ("net_arch", "critic_arch"):
         layers = getattr(options, name, ())
         if len(layers) > _MOST_LAYERS:
@@ -207,7 +210,7 @@ def check_sizes(options: Any, width: int) -> None:
     )
 
 
-def _check_numbers(options: PpoOptions | SacOptions) -> None:
+def _check_numbers(options: PolicyGradientOptions | DaggerOptions | PpoOptions | SacOptions) -> None:
     """Refuse hyperparameters that make no sense.
 
     Raises:
@@ -215,10 +218,14 @@ def _check_numbers(options: PpoOptions | SacOptions) -> None:
     """
     for name in {field.name for field in fields(options)} & {*_POSITIVE, *_SHARES, *_WEIGHTS}:
         value = getattr(options, name)
+        least = "> 0" if name in _POSITIVE else ">= 0"
         if not 0.0 <= value < math.inf or (name in _POSITIVE and value == 0.0):
-            raise ValueError(f"hyperparameter {name} must be finite and positive, got {shown(value)}")
+            raise ValueError(f"hyperparameter {name} must be finite and {least}, got {shown(value)}")
         if name in _SHARES and value > 1.0:
             raise ValueError(f"hyperparameter {name} must be at most 1, got {shown(value)}")
+    separation = getattr(options, "separation", None)
+    if separation is not None and not 0.0 < separation < math.inf:
+        raise ValueError(f"hyperparameter separation must be finite and > 0 m, got {shown(separation)}")
     if options.episode_steps is not None and options.episode_steps < 1:
         raise ValueError(f"hyperparameter episode_steps must be >= 1, got {shown(options.episode_steps)}")
     if not options.net_arch or min(options.net_arch) < 1:
