@@ -8,6 +8,7 @@ from reprlib import Repr
 
 _MOST_DIGITS = 40
 _LIKE = 0.5  # likeness, 0 to 1, from which a name is suggested
+_PART = 4  # characters, from which a part of a name stands for it
 _WORD, _LINE = 240, 2000  # characters
 
 
@@ -45,9 +46,12 @@ def shortened(text: str) -> str:
 
 
 def nearest_name(name: object, known: Iterable[str], like: float = _LIKE) -> str | None:
-    """The known name that this one is a slip of, if there is one; at least `like` it, 0 to 1."""
-    near = difflib.get_close_matches(str(name)[:100], list(known), n=1, cutoff=like)
-    return near[0] if near else None
+    """The known name that this one is a slip of, at least `like` it, 0 to 1, or of which alone it is a part."""
+    text, names = str(name)[:100], list(known)
+    near = difflib.get_close_matches(text, names, n=1, cutoff=like)
+    if not near and len(text) >= _PART:
+        near = [one for one in names if text.lower() in one.lower()]
+    return near[0] if len(near) == 1 else None
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], like: float = _LIKE) -> str:
