@@ -46,7 +46,7 @@ def shortened(text: str) -> str:
 
 
 def nearest_name(name: object, known: Iterable[str], like: float = _LIKE) -> str | None:
-    """The known name that this one is a slip of, at least `like` it, 0 to 1, or of which alone it is a part."""
+    """The known name that this is a slip of, at least `like` it, 0 to 1, or of which alone it is a part."""
     text, names = str(name)[:100], list(known)
     near = difflib.get_close_matches(text, names, n=1, cutoff=like)
     if not near and len(text) >= _PART:
