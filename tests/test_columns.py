@@ -121,3 +121,10 @@ def test_a_record_answers_to_the_name_of_before_with_a_warning():
     evaluation = evaluate("lqr", HELIX, episodes=1)
     with pytest.warns(DeprecationWarning, match="now quadratic_cost"):
         assert evaluation.records[0].cost == evaluation.records[0].quadratic_cost
+
+
+@pytest.mark.parametrize("value", [0.25, -3.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("name", ["score", "min_separation", "settling_time"])
+def test_a_vehicle_alone_counts_as_a_team_of_vehicles_like_it(name, value):
+    column = COLUMNS[name]
+    assert str(column.of_team([value])) == str(column.of_team([value, value]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Flag, auto
@@ -77,6 +78,9 @@ class Column:
 
     def of_team(self, values: Sequence[float]) -> float:
         """The number of a flight from those of its vehicles, nan where they have none."""
+        if len(values) == 1 and not self.has(LEAST | LARGEST):
+            (value,) = values
+            return float(value) if math.isfinite(value) else float("nan")
         x = np.array(values, dtype=np.float64)
         if self.has(LEAST):
             return float(x.min())

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, NamedTuple, TypeVar
 
 from ..evaluation.column import COMPARED, Column
 from ..evaluation.columns import COLUMNS, fallbacks, limits_in, shown
@@ -19,6 +20,7 @@ from .protocol import protocol_facts
 from .suite import BEST_MPC, Suite
 from .units import Unit, suite_units
 
+T = TypeVar("T")
 _INTERVAL = Column("", "", "half width of its 95 % interval", printed="+-", name="score_minus_base_ci")
 
 
@@ -41,19 +43,34 @@ class Results:
     evaluations: tuple[Evaluation, ...]  # one per unit of `flown`
     trainings: tuple[Mapping[str, Any], ...] = ()  # one per unit of `training_units`; empty if it failed
     failures: tuple[Failure, ...] = ()
+    _known: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # by `_once`
+
+    def _once(self, what: Hashable, make: Callable[[], T]) -> T:
+        """What follows from the results is found once: tables and pages ask for it many times."""
+        if what not in self._known:
+            self._known[what] = make()
+        found: T = self._known[what]
+        return found
 
     def flown(self) -> list[Unit]:
         """Units of the suite but those that failed."""
+        return list(self._once("units", self._find_units))
+
+    def _find_units(self) -> list[Unit]:
         failed = {(one.env, one.policy) for one in self.failures}
         return [unit for unit in suite_units(self.suite) if (unit.env.title, unit.policy.title) not in failed]
 
     def get(self, env: str, policy: str) -> Evaluation:
         """The evaluation of a policy in an environment, by their titles."""
-        for unit, evaluation in zip(self.flown(), self.evaluations, strict=True):
-            if (unit.env.title, unit.policy.title) == (env, policy):
-                return evaluation
+        found = self._once("evaluations", self._by_titles).get((env, policy))
+        if found is not None:
+            return found
         why = [f": {one.message}" for one in self.failures if (one.env, one.policy) == (env, policy)]
         raise KeyError(f"no evaluation of {policy!r} in {env!r}{''.join(why)}")
+
+    def _by_titles(self) -> dict[tuple[str, str], Evaluation]:
+        flown = zip(self.flown(), self.evaluations, strict=True)
+        return {(unit.env.title, unit.policy.title): evaluation for unit, evaluation in flown}
 
     def rows(self) -> list[dict[str, Any]]:
         """One row per environment x policy x flight, of a team one per vehicle (column agent)."""
@@ -72,10 +89,16 @@ class Results:
 
     def summary(self) -> list[dict[str, Any]]:
         """One row per environment x policy: means, half widths (_ci), paired differences (_minus_base)."""
+        return [dict(row) for row in self._once("summary", self._summary)]
+
+    def _summary(self) -> list[dict[str, Any]]:
         return [self._summary_row(unit) for unit in self.flown()]
 
     def base_of(self, env: str) -> str:
         """Title of the policy from which differences are taken: the suite's, else the first flown there."""
+        return self._once(("base", env), partial(self._find_base, env))
+
+    def _find_base(self, env: str) -> str:
         flown = [unit.policy for unit in self.flown() if unit.env.title == env]
         titles = [policy.title for policy in flown]
         if self.suite.base == BEST_MPC:
@@ -114,6 +137,9 @@ class Results:
 
     def contender_rows(self) -> list[dict[str, Any]]:
         """One row per environment x contender, where all training seeds of an algorithm are one contender."""
+        return [dict(row) for row in self._once("contenders", self._contender_rows)]
+
+    def _contender_rows(self) -> list[dict[str, Any]]:
         names = {policy.title: policy.contender for policy in self.suite.policies} | {BEST_MPC: BEST_MPC}
         contenders = find_contenders(self.suite, self.flown(), self.evaluations, self.trainings)
         tables = [one.label for one in self.suite.tables] or [""]
