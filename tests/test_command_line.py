@@ -155,6 +155,7 @@ def test_evaluate_discards_another_run_if_asked_to(capsys, tmp_path):
     [
         (["evalute", HELIX, "hover"], "unknown command 'evalute'; did you mean 'evaluate'"),
         (["evaluate", "quad/HelixTrack-v0", "hover"], "did you mean 'quad/HelixTracking-v0'"),
+        (["evaluate", HELIX, "hover", "--out", ""], "must name a file or folder, got nothing"),
         (["evaluate", "helix", "hover"], "did you mean 'quad/HelixTracking-v0'"),
         (["evaluate", HELIX, "hovr"], "unknown policy 'hovr'; did you mean 'hover'"),
         (["evaluate", HELIX, "random", "--policy-set", "sed=1"], "did you mean 'seed'"),

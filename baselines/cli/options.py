@@ -27,13 +27,21 @@ def _number(text: str) -> float:
         raise argparse.ArgumentTypeError(f"must be a number, got {text[:80]!r}") from None
 
 
+def _path(text: str) -> Path:
+    if not text.strip():
+        raise argparse.ArgumentTypeError(
+            "must name a file or folder, got nothing; . is the folder you are in"
+        )
+    return Path(text)
+
+
 # What an option is read as; the others are text.
 _KINDS: dict[Any, Callable[[str], Any]] = {
     int: _whole,
     int | None: _whole,
     float | None: _number,
-    Path: Path,
-    Path | None: Path,
+    Path: _path,
+    Path | None: _path,
 }
 
 
@@ -297,7 +305,7 @@ def add_options(parser: argparse.ArgumentParser, kind: type[Any]) -> None:
                 "metavar": _REPEATED.get(entry.name, "NAME"),
             }
         elif hint is not bool:
-            of_kind = {_whole: "N", _number: "S", Path: "FILE" if _is_file(str(text)) else "FOLDER"}
+            of_kind = {_whole: "N", _number: "S", _path: "FILE" if _is_file(str(text)) else "FOLDER"}
             settings["metavar"] = of_kind.get(settings["type"], "NAME")
         if positional:
             parser.add_argument(entry.name, **settings)
