@@ -14,6 +14,7 @@ import stat
 import sys
 import threading
 from collections.abc import Iterator
+from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
@@ -78,6 +79,26 @@ def remembered(*, terminate: bool = False) -> Iterator[None]:
             signal.signal(number, usual[number])
         sys.unraisablehook = hook
         _memory.pending = None
+
+
+def submit_to(pool: Executor, *call: Any) -> Future[Any]:
+    """`submit` of a pool of loky whose processes hear no Ctrl-C: who begins them hears it, and ends them.
+
+    A terminal sends it to all of them at once, also to one that is still importing and can only print where.
+    """
+    from multiprocessing import resource_tracker
+
+    from joblib.externals.loky.backend import resource_tracker as of_loky
+
+    if not hasattr(signal, "pthread_sigmask"):  # Windows has none
+        return pool.submit(*call)
+    for tracker in (resource_tracker, of_loky):  # which let the signal through again when they begin
+        tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        return pool.submit(*call)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def raise_lost() -> None:

@@ -374,8 +374,12 @@ def test_a_writer_that_dies_between_two_files_leaves_a_checkpoint(tmp_path, monk
 
 
 def test_weights_of_before_whose_description_is_another_are_refused(tmp_path):
+    """They bring no description of their own."""
+    from safetensors.numpy import load_file, save_file
+
     folder = tmp_path / "net"
     shutil.copytree(SHIPPED / "apg-helix", folder)
+    save_file(load_file(folder / "network.safetensors"), folder / "network.safetensors")
     describe(folder, digest="0")
     with pytest.raises(CheckpointError, match="describes other weights"):
         load_checkpoint(folder)

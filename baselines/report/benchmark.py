@@ -99,11 +99,11 @@ def fly_suite(
         require_jobs(order.jobs, here=order.engine == "processes")
     require_disjoint_starts(suite)
     _refuse_no_folder(suite, out, order)
-    if out is not None:
-        _refuse_objects(suite)
     if order.engine == SHARED_FOLDER:
         _refuse_unshared(given, order)
     failed = _refuse_bad_units(suite, given)
+    if out is not None:
+        _refuse_objects(suite)
     folder = None if out is None else Path(out).absolute()
     with nullcontext() if folder is None else locked(folder):
         sweep = Sweep(suite, given, failed, folder, order)

@@ -22,6 +22,7 @@ from numba.core import event
 from quad_envs.compilation.decorators import announce_no_more, kept_in
 from quad_envs.registration import TEAMS, TRACKING
 
+from ..interruptions import submit_to
 from ..policies.environments import make_env, task_of
 from ..policies.registry import TEAM_POLICIES, TRACKING_POLICIES, PolicyEntry, make_policy, serving
 from ..policies.trained import shipped_for
@@ -243,7 +244,7 @@ class _Helpers(event.Listener):
             with contextlib.suppress(IndexError):  # another one was faster
                 piece, begin = self._waiting.popleft(), perf_counter()
                 try:
-                    pool.submit(_call, sys.path, dumps(piece)).result()
+                    submit_to(pool, _call, sys.path, dumps(piece)).result()
                 except Exception:  # the caller meets it where it can be seen
                     self._waiting.append(piece)
                     return

@@ -25,6 +25,7 @@ from quad_envs.arguments.names import unknown_name
 
 from ..errors import ResultsError
 from ..files import source_digest
+from ..interruptions import submit_to
 
 Unit = TypeVar("Unit")
 Submit = Callable[..., "Future[Any]"]
@@ -170,11 +171,10 @@ def _processes(jobs: int | None) -> Iterator[Submit]:
     def submit(*call: Any) -> Future[Any]:
         nonlocal pool
         try:
-            found: Future[Any] = pool.submit(*call)
+            return submit_to(pool, *call)
         except BrokenProcessPool:  # one of its processes has died
             pool = begin()
-            found = pool.submit(*call)
-        return found
+            return submit_to(pool, *call)
 
     try:
         yield submit
