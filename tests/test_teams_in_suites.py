@@ -179,3 +179,11 @@ def test_a_controller_of_a_team_is_tuned(tmp_path):
     )
     assert found.policy == "consensus-mpc" and len(found.options["R"]) == 4
     assert np.isfinite(found.best.score) and found.best.flights == 5 * 3
+
+
+def test_a_comparison_with_the_best_mpc_needs_an_mpc_everywhere(tmp_path):
+    without = SINGLE | {"policies": [{"name": "lmpc", "envs": ["Helix"]}, {"name": "hover"}]}
+    without |= {"tables": []}
+    with pytest.raises(ValueError, match=r"compares with the best MPC, and no policy in 'Spiral' is an MPC"):
+        run_benchmark(suite_from_dict(without), out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()

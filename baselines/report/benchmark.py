@@ -23,11 +23,12 @@ from ..policies.outside import name_of
 from ..policies.registry import behind_filter, from_outside, is_trained, make_policy, policy_entry
 from ..sweeps.choices import Condition, EnvChoice, PolicyChoice
 from ..sweeps.comparison import Results
+from ..sweeps.contenders import plans
 from ..sweeps.engines import SHARED_FOLDER, check_engine
 from ..sweeps.finished import check_unit
 from ..sweeps.folder import read_config, read_run
 from ..sweeps.protocol import require_disjoint_starts
-from ..sweeps.suite import Suite
+from ..sweeps.suite import BEST_MPC, Suite
 from ..sweeps.suite_files import load_suite
 from ..sweeps.sweep import Order, Sweep, Watcher, with_given
 from ..sweeps.units import Given, Unit, suite_units, training_units
@@ -98,6 +99,7 @@ def fly_suite(
     if order.jobs is not None:
         require_jobs(order.jobs, here=order.engine == "processes")
     require_disjoint_starts(suite)
+    _refuse_no_mpc(suite)
     _refuse_no_folder(suite, out, order)
     if order.engine == SHARED_FOLDER:
         _refuse_unshared(given, order)
@@ -115,6 +117,16 @@ def fly_suite(
             for name, picture in frontier_files(report).items():
                 write_atomic(folder / name, picture.encode())
         return results
+
+
+def _refuse_no_mpc(suite: Suite) -> None:
+    """Differences to the best MPC need one in every environment."""
+    for env in suite.envs if suite.base == BEST_MPC else ():
+        if not any(plans(policy) and not policy.trace for policy in suite.policies_in(env)):
+            raise ValueError(
+                f"suite {suite.name!r} compares with the {BEST_MPC}, and no policy in {env.title!r} "
+                "is an MPC: add one, such as lmpc, or set compare_with to the title of a policy"
+            )
 
 
 def _refuse_no_folder(suite: Suite, out: str | Path | None, order: Order) -> None:
