@@ -107,5 +107,6 @@ def vehicle_values(name: object) -> dict[str, Any]:
         ValueError: If there is no vehicle of that name.
     """
     if not isinstance(name, str) or name not in VEHICLES:
-        raise ValueError(unknown_name("vehicle", str(name)[:80], list(VEHICLES)))
+        many = "; how many there are is said by vehicles" if isinstance(name, int) else ""
+        raise ValueError(unknown_name("vehicle", str(name)[:80], list(VEHICLES)) + many)
     return VEHICLES[name].values()

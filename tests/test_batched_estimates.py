@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from baselines import EstimateVectorWrapper, EstimateWrapper, check_policy, evaluate, load_policy, make_policy
+from baselines import (
+    EstimateVectorWrapper,
+    EstimateWrapper,
+    check_policy,
+    evaluate,
+    load_policy,
+    make_policy,
+    train,
+)
 from baselines.errors import CheckpointError
 from baselines.policies.checkpoints import save_checkpoint
 from baselines.policies.network import Network, NetworkPolicy
@@ -164,6 +172,9 @@ def test_a_network_of_another_sensor_is_refused_with_the_remedy(tmp_path):
     assert isinstance(load_policy(tmp_path, ranging), EstimatingPolicy)
     with pytest.raises(CheckpointError, match=r"with the sensor 'range'.*pass sensor='range', or train one"):
         load_policy(tmp_path, TARGET)
+    with pytest.raises(CheckpointError, match=r"with the sensor 'range'.*pass sensor='range', or train one"):
+        train(TARGET, "dagger", start_from=tmp_path, steps=100, out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_target_that_nobody_measures_is_nothing_to_learn_from():

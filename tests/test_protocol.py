@@ -14,7 +14,7 @@ from baselines.sweeps.budget import budget_of
 from baselines.sweeps.choices import PolicyChoice, Tuning
 from baselines.sweeps.contenders import Contender, _kind, find_base, plans, rank_of
 from baselines.sweeps.folder import read_run
-from baselines.sweeps.protocol import require_disjoint_starts
+from baselines.sweeps.protocol import refuse_taken_version, require_disjoint_starts
 from baselines.sweeps.suite import BEST_MPC, Suite
 from baselines.sweeps.units import suite_units, training_units
 from baselines.training.held_out import CHOOSING, HELD_OUT
@@ -137,6 +137,15 @@ def test_ranges_of_starts_for_training_judging_and_choosing_are_disjoint():
     suite = load_suite("quad-bench-2026.1")
     require_disjoint_starts(suite)
     assert HELD_OUT <= suite.seed and suite.seed + suite.episodes <= CHOOSING
+
+
+def test_a_suite_of_ones_own_under_the_version_of_a_shipped_protocol_is_refused(tmp_path):
+    ours = load_suite("quad-bench-2026.1")
+    refuse_taken_version(ours)
+    refuse_taken_version(ours.only(["Helix"]).quick())
+    with pytest.raises(ValueError, match=r"protocol 'quad-bench-2026.1', and has .*another version"):
+        run_benchmark(SMALL | {"protocol": "quad-bench-2026.1"}, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(("seed", "episodes"), [(9_999, 3), (0, 3), (19_998, 3), (20_000, 3)])

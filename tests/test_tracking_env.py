@@ -9,6 +9,7 @@ import pytest
 from processes import printed_compiled_and_plain
 
 import quad_envs
+from quad_envs import formation_v0
 from quad_envs.constraints import TOLERANCE, constraint_scales, constraint_values, forces_from_actions
 from quad_envs.dynamics import derivative_reference, simulate
 from quad_envs.reward import stage_cost
@@ -404,12 +405,58 @@ def test_kernels_run_as_plain_python_for_debugging():
     assert float(compiled) == pytest.approx(float(plain), rel=1e-6)
 
 
-@pytest.mark.parametrize("action", ["abc", ["a"] * 4, {"rotor": 1.0}])
+NO_NUMBERS = {
+    "text": "abc",
+    "texts": ["1"] * 4,
+    "mapping": {"rotor": 1.0},
+    "nothing": None,
+    "complex": np.full(4, 1j),
+    "objects": np.full(4, None),
+    "ragged": [1.0, [2.0], 3.0, 4.0],
+}
+
+
+@pytest.mark.parametrize("action", NO_NUMBERS.values(), ids=NO_NUMBERS)
 def test_an_action_that_is_no_number_is_refused_as_an_action(action):
     env = gym.make("quad/HelixTracking-v0").unwrapped
     env.reset(seed=0)
     with pytest.raises(ValueError, match="action must be 4 numbers, one per rotor, got"):
         env.step(action)
+
+
+@pytest.mark.parametrize("env_id", ["quad/HelixTracking-v0", "quad/Formation-v0"])
+@pytest.mark.parametrize("action", NO_NUMBERS.values(), ids=NO_NUMBERS)
+def test_a_vector_refuses_actions_that_are_no_numbers(env_id, action):
+    envs = formation_v0.vector_env(num_teams=2) if "Formation" in env_id else gym.make_vec(env_id, num_envs=2)
+    envs.reset(seed=0)
+    with pytest.raises(ValueError, match=r"actions must be numbers of shape .* got"):
+        envs.step(action if isinstance(action, str | dict | None) else [action] * envs.num_envs)
+
+
+@pytest.mark.parametrize("action", NO_NUMBERS.values(), ids=NO_NUMBERS)
+def test_a_team_refuses_an_action_that_is_no_number_and_names_the_agent(action):
+    env = formation_v0.parallel_env()
+    env.reset(seed=0)
+    actions = {agent: np.zeros(4, np.float32) for agent in env.agents} | {"quad_1": action}
+    with pytest.raises(ValueError, match="action of quad_1 must be 4 numbers, got"):
+        env.step(actions)
+
+
+@pytest.mark.parametrize("kind", [list, tuple, np.float64, np.int64, ">f4", "strided"])
+def test_an_action_may_be_any_real_numbers(kind):
+    rewards = []
+    for given in (np.array([1, 0, 1, 0], np.float32), _like(kind)):
+        env = gym.make("quad/HelixTracking-v0").unwrapped
+        env.reset(seed=0)
+        rewards.append(env.step(given)[1])
+    assert rewards[0] == rewards[1]
+
+
+def _like(kind):
+    plain = np.array([1, 0, 1, 0], np.float32)
+    if kind == "strided":
+        return np.repeat(plain, 2)[::2]
+    return kind([1, 0, 1, 0]) if kind in (list, tuple) else plain.astype(kind)
 
 
 def test_reset_options_that_are_no_mapping_are_refused_by_name():

@@ -16,7 +16,7 @@ from quad_envs.arguments.names import shown, unknown_name
 from ..errors import CheckpointError
 
 if TYPE_CHECKING:  # not at run time: tasks load numba, and `quad-envs list` has to be quick
-    from quad_envs.tasks import TeamTask
+    from quad_envs.tasks import BaseTask
 
     from .network import NetworkPolicy
     from .network_policies import EstimatingPolicy
@@ -111,8 +111,6 @@ def load_policy(source: str | os.PathLike[str], env: Any) -> NetworkPolicy | Est
     Raises:
         CheckpointError: If it is no checkpoint of this version, or was trained on another kind of task.
     """
-    from quad_envs.tasks import TeamTask
-
     from .checkpoints import load_checkpoint
     from .environments import task_of
     from .network_policies import network_policy
@@ -126,8 +124,7 @@ def load_policy(source: str | os.PathLike[str], env: Any) -> NetworkPolicy | Est
             f"{where} was trained on {shown(said.get('env_id'))}, a task of the kind {shown(mission)}; "
             f"{task.env_id} is one of {task.mission}: train one for it with quad-envs train {task.env_id}"
         )
-    if isinstance(task, TeamTask) and task.layout.target:
-        _require_sensor(where, said, task)
+    require_sensor(where, said, task)
     name = os.fspath(source) if folder.parent == SHIPPED else folder.name or str(folder)
     try:
         return network_policy(network, task, name, str(said.get("kind", "")))
@@ -136,14 +133,22 @@ def load_policy(source: str | os.PathLike[str], env: Any) -> NetworkPolicy | Est
         raise CheckpointError(f"{where}{made} does not fit {task.env_id}: {error}") from error
 
 
-def _require_sensor(where: str, said: Mapping[str, Any], task: TeamTask) -> None:
-    """Check that a network flies with the sensor with which it was trained.
+def require_sensor(where: str, said: Mapping[str, Any], task: BaseTask) -> None:
+    """Check that a network flies, or learns on, with the sensor with which it was trained.
+
+    Args:
+        where: What to call the network.
+        said: Its description.
+        task: Where it is to fly; of one without a target nothing is asked.
 
     Raises:
         CheckpointError: If it was another one.
     """
     from quad_envs.sensors import DEFAULT_SENSOR
+    from quad_envs.tasks import TeamTask
 
+    if not (isinstance(task, TeamTask) and task.layout.target):
+        return
     given = said.get("env_kwargs", {})
     trained = given.get("sensor", DEFAULT_SENSOR) if isinstance(given, Mapping) else task.sensor
     if trained != task.sensor:

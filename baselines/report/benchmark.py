@@ -27,7 +27,7 @@ from ..sweeps.contenders import plans
 from ..sweeps.engines import SHARED_FOLDER, check_engine
 from ..sweeps.finished import check_unit
 from ..sweeps.folder import read_config, read_run
-from ..sweeps.protocol import require_disjoint_starts
+from ..sweeps.protocol import refuse_taken_version, require_disjoint_starts
 from ..sweeps.suite import BEST_MPC, Suite
 from ..sweeps.suite_files import load_suite
 from ..sweeps.sweep import Order, Sweep, Watcher, with_given
@@ -99,6 +99,7 @@ def fly_suite(
     if order.jobs is not None:
         require_jobs(order.jobs, here=order.engine == "processes")
     require_disjoint_starts(suite)
+    refuse_taken_version(suite)
     _refuse_no_mpc(suite)
     _refuse_no_folder(suite, out, order)
     if order.engine == SHARED_FOLDER:

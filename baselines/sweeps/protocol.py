@@ -9,6 +9,7 @@ from typing import Any
 from ..errors import ResultsError
 from ..training.held_out import CHOOSING, HELD_OUT
 from .suite import Suite
+from .suite_files import load_suite, suite_names
 
 
 def starts(suite: Suite) -> dict[str, str]:
@@ -32,6 +33,23 @@ def require_disjoint_starts(suite: Suite) -> None:
             f"protocol {suite.protocol!r} judges starts {suite.seed} to {last}; they must lie in "
             f"{HELD_OUT} to {CHOOSING - 1}, since those below are for training and those above for choosing: "
             "change seed or episodes"
+        )
+
+
+def refuse_taken_version(suite: Suite) -> None:
+    """Check that a suite of one's own does not go by the version of a protocol that comes with the package.
+
+    Raises:
+        ValueError: If it does.
+    """
+    if suite.protocol not in suite_names():
+        return
+    shipped = load_suite(suite.protocol)
+    if shipped.protocol == suite.protocol and shipped.definition != suite.definition:
+        raise ValueError(
+            f"suite {suite.name!r} says that it is protocol {suite.protocol!r}, and has the definition "
+            f"{suite.definition}, where that one has {shipped.definition}: their numbers do not compare. "
+            "Give it another version (protocol = ...); for a part of that one name it, with --only"
         )
 
 

@@ -13,7 +13,7 @@ from quad_envs.tasks import Task, TeamTask
 from ..errors import CheckpointError, ResultsError
 from ..policies.checkpoints import load_checkpoint
 from ..policies.network import Network
-from ..policies.trained import checkpoint_folder
+from ..policies.trained import checkpoint_folder, require_sensor
 from ..policies.tuned import names_tuned
 from .algorithm_options import check_sizes
 from .algorithms import algorithm_for, check_training, require_packages, require_resumable
@@ -119,6 +119,7 @@ def _origin(source: str | Path, algorithm: str, task: Task | TeamTask) -> tuple[
             f"{shown(mission)}, and no training on {task.env_id}, one of {task.mission}, can go on from it: "
             "begin with a network of the same kind"
         )
+    require_sensor(repr(os.fspath(source)), said, task)
     return network, {name: said[name] for name in _ORIGIN if name in said}
 
 

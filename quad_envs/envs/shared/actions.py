@@ -1,13 +1,28 @@
-"""What is asked of actions before anything moves, compiled."""
+"""What is asked of actions before anything moves."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arguments.names import shown
 from ...compilation.decorators import kernel
 
 FLOAT32 = np.dtype(np.float32)  # of actions and observations; numpy takes longer to read `np.float32`
+
+
+def real_numbers(given: Any, what: str) -> NDArray[np.float32]:
+    """Actions as float32, contiguous; `what` names them and says what they must be.
+
+    Raises:
+        ValueError: If they are no real numbers: text, complex, objects, or lists of several lengths.
+    """
+    try:
+        return np.asarray(given).astype(FLOAT32, "C", "same_kind", copy=False)
+    except (TypeError, ValueError):
+        raise ValueError(f"{what}, got {shown(given)}") from None
 
 
 @kernel

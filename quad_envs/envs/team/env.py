@@ -16,7 +16,7 @@ from ...graphs import GraphTable
 from ...lanes import N_PLANT, PLANT
 from ...plant import Array
 from ...tasks import TeamTask
-from ..shared.actions import FLOAT32
+from ..shared.actions import FLOAT32, real_numbers
 from ..shared.render_modes import NO_RENDERING, checked_rendering
 from .batch import TeamBatch
 from .options import TeamOptions
@@ -230,10 +230,9 @@ class TeamEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: igno
             )
         for name in self.agents:
             action = actions[name]
-            if np.shape(action) != (self._action_size,) or not np.issubdtype(
-                np.asarray(action).dtype, np.number
-            ):
-                raise ValueError(f"action of {name} must be {self._action_size} numbers, got {shown(action)}")
+            what = f"action of {name} must be {self._action_size} numbers"
+            if real_numbers(action, what).shape != (self._action_size,):
+                raise ValueError(f"{what}, got {shown(action)}")
 
     def _let_fly(self, rows: NDArray[np.int64]) -> None:
         """These vehicles, (n,), are the agents from now on."""

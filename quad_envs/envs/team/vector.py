@@ -16,6 +16,7 @@ from ...arguments.checks import require_whole
 from ...lanes import N_PLANT, PLANT
 from ...plant import Array
 from ...tasks import TeamTask
+from ..shared.actions import real_numbers
 from ..shared.vector_parts import Generators, autoreset_of, presence, seeded
 from .batch import TeamBatch
 from .options import TeamOptions
@@ -153,7 +154,7 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
 
     def step(self, actions: NDArray[np.float32]) -> tuple[Observations, Array, Bools, Bools, dict[str, Any]]:
         """Hold the rotor commands of all vehicles over one control period."""
-        actions = np.ascontiguousarray(actions, dtype=np.float32)
+        actions = real_numbers(actions, f"actions must be numbers of shape {self.action_space.shape}")
         if actions.shape != self.action_space.shape:
             raise ValueError(f"actions must have shape {self.action_space.shape}, got {actions.shape}")
         if not self._generators:

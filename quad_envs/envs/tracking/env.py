@@ -10,13 +10,12 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ...arguments.names import shown
 from ...episode_limit import steps_asked
 from ...lanes import N_PLANT, PLANT
 from ...plant import Array
 from ...references.table_row import N_REFERENCE
 from ...tasks import Task
-from ..shared.actions import FLOAT32
+from ..shared.actions import FLOAT32, real_numbers
 from ..shared.render_modes import NO_RENDERING, RenderModes, checked_rendering
 from ..shared.specified import Specified
 from .batch import TrackingBatch
@@ -169,10 +168,9 @@ class TrackingEnv(Specified, gymnasium.Env[Observation, NDArray[np.float32]]):
         """Hold the rotor commands over one control period."""
         if self._np_random is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        try:
-            actions = np.ascontiguousarray(action, FLOAT32)
-        except (TypeError, ValueError):
-            raise ValueError(f"action must be 4 numbers, one per rotor, got {shown(action)}") from None
+        if action.__class__ is not np.ndarray or action.dtype is not FLOAT32:
+            action = real_numbers(action, "action must be 4 numbers, one per rotor")
+        actions = np.ascontiguousarray(action)
         if actions.shape != (4,):
             raise ValueError(f"action must have shape (4,), one entry per rotor, got {actions.shape}")
         observation = np.empty(self._size, FLOAT32)

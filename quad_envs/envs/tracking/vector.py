@@ -17,7 +17,7 @@ from ...lanes import N_PLANT, PLANT
 from ...plant import Array
 from ...references.table_row import N_REFERENCE
 from ...tasks import Task
-from ..shared.actions import FLOAT32
+from ..shared.actions import FLOAT32, real_numbers
 from ..shared.given import as_numbers, given_plants
 from ..shared.render_modes import NO_RENDERING, checked_rendering
 from ..shared.specified import Specified
@@ -139,7 +139,7 @@ class TrackingVectorEnv(
 
     def step(self, actions: NDArray[np.float32]) -> _Step:
         """Hold the rotor commands of all flights over one control period."""
-        actions = np.ascontiguousarray(actions, FLOAT32)
+        actions = real_numbers(actions, f"actions must be numbers of shape ({self.num_envs}, 4)")
         if actions.shape != (self.num_envs, 4):
             raise ValueError(f"actions must have shape ({self.num_envs}, 4), got {actions.shape}")
         if not self._generators:
