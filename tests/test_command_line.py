@@ -142,6 +142,39 @@ def test_flights_that_are_asked_for_later_are_flown_and_saved(tmp_path):
     assert len(list((tmp_path / "episodes").iterdir())) == 3
 
 
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ((HELIX, "apg-helix"), []),
+        ((HELIX, "nmpc", "--set", "mass=0.8"), []),
+        (
+            (HELIX, "apg-helix", "--set", "mass=0.8"),
+            [f"apg-helix was trained on {HELIX}; here it flies {HELIX} with mass=0.8"],
+        ),
+        (
+            ("quad/LineTracking-v0", "apg-helix"),
+            [f"apg-helix was trained on {HELIX}; here it flies quad/LineTracking-v0"],
+        ),
+        (
+            (
+                "quad/CorridorTracking-v0",
+                "safe:nmpc",
+                "--set",
+                "disturbance=gusts",
+                "--set",
+                "sensor_noise=0",
+            ),
+            ["the filter of safe:nmpc predicts without disturbance: limits may be broken in spite of it"],
+        ),
+    ],
+)
+def test_evaluate_says_what_a_policy_was_not_made_for(capsys, arguments, expected):
+    assert main(["evaluate", *arguments, "--episodes", "1", "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["episodes"] == 1
+    assert [line.removeprefix("note: ") for line in err.splitlines() if line.startswith("note")] == expected
+
+
 def test_evaluate_discards_another_run_if_asked_to(capsys, tmp_path):
     arguments = ["evaluate", HELIX, "hover", "--out", str(tmp_path), "--episodes"]
     assert main([*arguments, "2"]) == 0

@@ -155,6 +155,19 @@ def test_both_signals_save_the_run_and_end_with_the_code_of_the_shell(
     assert main([*arguments, "--resume"]) == 0
 
 
+def test_an_interrupted_evaluation_says_how_to_go_on(tmp_path, capsys, monkeypatch):
+    from baselines.report import benchmark
+
+    arguments = ["evaluate", HELIX, "hover", "--episodes", "2", "--out", str(tmp_path / "run")]
+    with monkeypatch.context() as patched:
+        patched.setattr(benchmark, "build_report", lambda run: press())
+        assert main(arguments) == 130
+    out, err = capsys.readouterr()
+    assert out == "" and "the same command goes on with it" in err
+    assert main(arguments) == 0
+    assert "2 flights from seed 0" in capsys.readouterr().out
+
+
 def test_a_run_that_ended_before_its_first_policy_begins_anew(tmp_path, capsys, learner):
     learner(pressing(1, press))
     arguments = ["train", HELIX, "stub", "--steps", "500", "--out", str(tmp_path / "run")]

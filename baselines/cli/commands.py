@@ -218,6 +218,7 @@ def evaluate_one(options: EvaluateOptions) -> int:
     from ..evaluation.evaluate import fly_and_measure
     from ..policies.environments import make_env
     from ..policies.registry import make_policy, policy_name
+    from ..policies.unfamiliar import unfamiliar
     from ..report.benchmark import run_benchmark
     from ..sweeps.choices import EnvChoice, PolicyChoice
     from ..sweeps.suite import Suite
@@ -230,10 +231,14 @@ def evaluate_one(options: EvaluateOptions) -> int:
     if options.out is not None:
         choices = (EnvChoice(options.env, env_kwargs),), (PolicyChoice(options.policy, policy_kwargs),)
         suite = Suite("evaluate", *choices, options.episodes, options.seed)
-        with plain_warnings():
-            results = run_benchmark(
-                suite, options.out, save_episodes=options.save_episodes, fresh=options.fresh
-            )
+        try:
+            with plain_warnings():
+                results = run_benchmark(
+                    suite, options.out, save_episodes=options.save_episodes, fresh=options.fresh
+                )
+        except KeyboardInterrupt as interruption:
+            say(f"interrupted; what was flown is in {options.out}, and the same command goes on with it")
+            return exit_code(interruption)
         found = results.evaluations[0]
         _say_where(options.out)
     else:
@@ -244,6 +249,8 @@ def evaluate_one(options: EvaluateOptions) -> int:
             count = lambda episode: bar.update(episode.seed - options.seed + 1 - bar.n)  # noqa: E731
             found = fly_and_measure(policy, env, options.episodes, options.seed, on_episode=count)
         found = replace(found, policy=policy_name(policy, options.policy))
+    for remark in unfamiliar(options.policy, options.env, env_kwargs):
+        say(f"note: {remark}")
     print(json.dumps(found.to_dict(), indent=1, allow_nan=False) if options.json else found)
     return 0
 
