@@ -50,6 +50,18 @@ def test_a_dataset_holds_the_flights_that_evaluate_measures():
     assert found.score == pytest.approx(measured.summary()["score"].mean)
 
 
+def test_minaris_normalized_score_is_the_score_of_evaluate():
+    record(make(), ["lqr", "random"], NAME, episodes=2, seed=3)
+    dataset = minari.load_dataset(NAME)
+    returns = np.array([episode.rewards.sum() for episode in dataset.iterate_episodes()])
+    scores = [one.score for name, seed in (("lqr", 3), ("random", 5)) for one in evaluated(name, seed)]
+    assert minari.get_normalized_score(dataset, returns) == pytest.approx(scores, rel=1e-6)
+
+
+def evaluated(name, seed):
+    return evaluate(make_policy(name, make()), make(), episodes=2, seed=seed).records
+
+
 def test_the_environment_and_its_seeds_come_back_so_that_actions_give_the_same_flight():
     record(make(), "lmpc", NAME, episodes=2, seed=3)
     env = minari.load_dataset(NAME).recover_environment()

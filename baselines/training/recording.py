@@ -141,6 +141,8 @@ def record(
         "algorithm_name": said,
         "description": f"{env.spec.id}: {episodes} episodes by each of {said}, from seed {seed}",
         "quad_envs_version": quad_envs.__version__,
+        "ref_min_score": 0.0,  # of a return: Minari's normalized score is the score of every table here
+        "ref_max_score": float(env.unwrapped.task.episode_steps),
     }
     tape, count, sums = _Tape(env), 0, []
     with _new_dataset(dataset, env, about) as (storage, keep):
