@@ -3,11 +3,11 @@
     python docs/protocol.py          # the pages anew from the numbers that are published
     python docs/protocol.py RUN      # publish those of a results folder first, with its frontiers
 
-A run may be a part of the protocol: its environments take the place of what was published of them, and the
-others stay. Published are the rows of `contenders.csv` for each environment, as they are, and what each run
-says of itself; means over environments are taken here. docs/results/protocol.md has them all,
-docs/results/learned.md and README the best MPC beside the best network. MkDocs does not read this file; a
-test holds the pages to what it writes.
+A run may be a part of the protocol: its environments, under the conditions in which it flew them, take the
+place of what was published of them, and the others stay. Published are the rows of `contenders.csv` for each
+environment, as they are, and what each run says of itself; means over environments are taken here.
+docs/results/protocol.md has them all, docs/results/learned.md and README the best MPC beside the best
+network. MkDocs does not read this file; a test holds the pages to what it writes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import re
 import shutil
 import statistics
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from baselines import load_suite
 from baselines.files import write_atomic, write_csv
 from baselines.report.answer import percent, rounded
 from baselines.report.build import file_words
+from baselines.sweeps.choices import is_for
 from baselines.sweeps.contenders import ALL, VIOLATING, rank
 from baselines.sweeps.suite import BEST_MPC, Suite
 
@@ -56,18 +57,19 @@ def publish(run: Path) -> None:
 
     Raises:
         ValueError: If the folder holds no results of a protocol; results of another definition or of other
-            starts than those that stay; or less of an environment than is published.
+            starts than those that stay; or fewer policies than are published of a condition.
     """
     config = json.loads((run / "config.json").read_text("utf-8"))
     if not config.get("protocol"):
         raise ValueError(f"{str(run)!r} holds no results of a protocol: fly quad-bench-2026.1 into it")
     said = {name: config["protocol"][name] for name in ("version", "definition", "starts")}
     new = [row for row in _read(run / "contenders.csv") if row["env"] != ALL]
-    envs = list(dict.fromkeys(row["env"] for row in new))
+    places = dict.fromkeys(map(_place, new))
+    envs = list(dict.fromkeys(env for env, _ in places))
     old = _read(NUMBERS) if NUMBERS.exists() else []
-    stays = [row for row in old if row["env"] not in envs]
+    stays = [row for row in old if _place(row) not in places]
     facts = json.loads(FACTS.read_text("utf-8")) if old else {"protocol": said, "runs": []}
-    lost = {_cell(row) for row in old if row["env"] in envs} - {_cell(row) for row in new}
+    lost = {_cell(row) for row in old if _place(row) in places} - {_cell(row) for row in new}
     if facts["protocol"] == said and lost:
         raise ValueError(
             f"{str(run)!r} lacks {len(lost)} of the cells that are published, {', '.join(min(lost))!r} among "
@@ -78,14 +80,30 @@ def publish(run: Path) -> None:
             f"{str(run)!r} flew {said}, and published are numbers of {facts['protocol']}, which do not "
             f"compare: fly all environments again, or delete {NUMBERS.name} first"
         )
-    flown = {"envs": envs, "flown": config["protocol"]["flown"]} | {name: config[name] for name in OF_A_RUN}
-    earlier = [one | {"envs": [env for env in one["envs"] if env not in envs]} for one in facts["runs"]]
-    runs = [*(one for one in earlier if one["envs"]), flown]
+    conditions = {env: [condition for where, condition in places if where == env] for env in envs}
+    flown = {"envs": conditions, "flown": config["protocol"]["flown"]}
+    earlier = [one | {"envs": _left(one["envs"], places)} for one in facts["runs"]]
+    runs = [*(one for one in earlier if one["envs"]), flown | {name: config[name] for name in OF_A_RUN}]
     write_atomic(FACTS, (json.dumps({"protocol": said, "runs": runs}, indent=1) + "\n").encode())
-    order = [env.title for env in load_suite(said["version"]).envs]
-    write_csv(NUMBERS, sorted([*stays, *new], key=lambda row: order.index(row["env"])))
+    suite = load_suite(said["version"])
+    order = {env.title: k for k, env in enumerate(suite.envs)}
+    under = {condition.label: k for k, condition in enumerate(suite.conditions)}
+    tables = {table.label: k for k, table in enumerate(suite.tables)}
+    place = lambda row: (order[row["env"]], tables[row["table"]], under[row["condition"]])  # noqa: E731
+    write_csv(NUMBERS, sorted([*stays, *new], key=place))
     for env in envs:
-        _take_frontiers(run, file_words(env))
+        if NOMINAL in conditions[env]:
+            _take_frontiers(run, file_words(env))
+
+
+def _left(envs: Mapping[str, Sequence[str]], places: Container[tuple[str, str]]) -> dict[str, list[str]]:
+    """Environments and conditions of a run that no other run has flown anew."""
+    found = {env: [one for one in flown if (env, one) not in places] for env, flown in envs.items()}
+    return {env: conditions for env, conditions in found.items() if conditions}
+
+
+def _place(row: Row) -> tuple[str, str]:
+    return row["env"], row["condition"]
 
 
 def _cell(row: Row) -> tuple[str, ...]:
@@ -165,16 +183,25 @@ def tables() -> str:
 def _origin(facts: dict[str, Any], suite: Suite) -> str:
     """Which environments were flown at which revision, and which were not."""
     said, runs = facts["protocol"], facts["runs"]
-    flown = [env for run in runs for env in run["envs"]]
-    missing = [env.title for env in suite.envs if env.title not in flown]
+    every = {
+        env.title: [one.label for one in suite.conditions if is_for(one.envs, env)] for env in suite.envs
+    }
+    left = _left(every, {(env, one) for run in runs for env in run["envs"] for one in run["envs"][env]})
+
+    def named(envs: Mapping[str, Sequence[str]]) -> str:
+        """Environments, with their conditions where they are not all of them."""
+        some = {env: "" if len(of) == len(every[env]) else f" ({'; '.join(of)})" for env, of in envs.items()}
+        return ", ".join(f"{env}{conditions}" for env, conditions in some.items())
+
+    missing = named(left)
     parts = [
-        f"{', '.join(run['envs'])} at revision {run['git_revision'][:7]} (digest `{run['flown']}`)"
+        f"{named(run['envs'])} at revision {run['git_revision'][:7]} (digest `{run['flown']}`)"
         for run in runs
     ]
     return (
         f"Definition `{said['definition']}`, judged starts {said['starts']['judging']}. "
         f"Flown: {'; '.join(parts)}. "
-        f"{'Not flown: ' + ', '.join(missing) + '.' if missing else 'That is all of it.'}\n"
+        f"{f'Not flown: {missing}.' if missing else 'That is all of it.'}\n"
     )
 
 

@@ -182,13 +182,14 @@ def protocol(tmp_path, monkeypatch):
         monkeypatch.setattr(made, name, tmp_path / file)
     real = made._read(ROOT / "docs" / "results" / "protocol.csv")
 
-    def flown(name, env, start=10_000, conditions=("nominal", "gusts"), like="Helix"):
+    def flown(name, env, start=10_000, conditions=("nominal", "gusts"), like="Helix", without=""):
         run = tmp_path / name
         run.mkdir()
         of = {"version": "quad-bench-2026.1", "definition": "d", "flown": name, "starts": {"judging": start}}
         config = {"protocol": of, "git_revision": name * 10, "platform": "", "versions": {}}
         (run / "config.json").write_text(json.dumps(config))
         rows = [row for row in real if row["env"] == like and row["condition"] in conditions]
+        rows = [row for row in rows if row["policy"] != without]
         write_csv(run / "contenders.csv", [row | {"env": env} for row in rows])
         (run / f"frontier-{env.lower()}-nominal-levelled.svg").write_text(name)
         return run
@@ -206,7 +207,10 @@ def test_a_part_of_the_protocol_takes_the_place_of_what_was_published_of_its_env
         "Line"
     ]
     runs = json.loads(made.FACTS.read_text())["runs"]
-    assert [(run["envs"], run["flown"]) for run in runs] == [(["Spiral"], "second"), (["Line"], "third")]
+    assert [(run["envs"], run["flown"]) for run in runs] == [
+        ({"Spiral": ["nominal", "gusts"]}, "second"),
+        ({"Line": ["nominal", "gusts", "sensor noise"]}, "third"),
+    ]
     assert (made.PLACE / "frontier-line-levelled.svg").read_text() == "third"
     means = [row for row in rows if row["env"] == made.ALL]
     assert {(row["environments"], row["condition"]) for row in means} == {("2", "nominal"), ("2", "gusts")}
@@ -217,6 +221,22 @@ def test_a_part_of_the_protocol_takes_the_place_of_what_was_published_of_its_env
         assert made._half(mean) == pytest.approx(made._half(one) / 2**0.5, abs=1e-15)
 
 
+def test_conditions_that_were_flown_later_stand_beside_those_that_were_flown_before(protocol):
+    made, flown = protocol
+    made.publish(flown("first", "Helix"))
+    made.publish(flown("later", "Helix", conditions=("gusts", "sensor noise")))
+    assert list(dict.fromkeys(row["condition"] for row in made.published())) == [
+        *("nominal", "gusts", "sensor noise")
+    ]
+    runs = json.loads(made.FACTS.read_text())["runs"]
+    assert [run["envs"] for run in runs] == [{"Helix": ["nominal"]}, {"Helix": ["gusts", "sensor noise"]}]
+    assert (made.PLACE / "frontier-helix-levelled.svg").read_text() == "first"  # drawn in still air alone
+    origin = made.tables().splitlines()[0]
+    assert "Flown: Helix (nominal) at revision first" in origin.replace("firstfi", "first")
+    assert "; Helix (gusts; sensor noise) at revision laterla" in origin
+    assert "Not flown: Helix (weak rotors, far starts; " in origin and ", Random, Corridor, " in origin
+
+
 def test_what_does_not_compare_is_not_published_together(protocol):
     made, flown = protocol
     made.publish(flown("first", "Line"))
@@ -224,7 +244,7 @@ def test_what_does_not_compare_is_not_published_together(protocol):
     with pytest.raises(ValueError, match="do not compare"):
         made.publish(flown("quick", "Spiral", start=5))
     with pytest.raises(ValueError, match=r"lacks \d+ of the cells.*fly all of Line"):
-        made.publish(flown("less", "Line", conditions=("nominal",)))
+        made.publish(flown("less", "Line", without="lmpc"))
     assert (made.NUMBERS.read_bytes(), made.FACTS.read_bytes()) == kept
     made.publish(flown("anew", "Line", start=5))
     assert json.loads(made.FACTS.read_text())["protocol"]["starts"] == {"judging": 5}
