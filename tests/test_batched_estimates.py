@@ -172,6 +172,12 @@ def test_a_network_of_another_sensor_is_refused_with_the_remedy(tmp_path):
     assert isinstance(load_policy(tmp_path, ranging), EstimatingPolicy)
     with pytest.raises(CheckpointError, match=r"with the sensor 'range'.*pass sensor='range', or train one"):
         load_policy(tmp_path, TARGET)
+
+
+def test_no_training_goes_on_from_a_network_of_another_sensor(tmp_path):
+    pytest.importorskip("torch", reason="without it the training is refused for that")
+    about = {"env_id": TARGET, "mission": "target-tracking", "env_kwargs": {"sensor": "range"}}
+    save_checkpoint(tmp_path, seeing_estimates(), about)
     with pytest.raises(CheckpointError, match=r"with the sensor 'range'.*pass sensor='range', or train one"):
         train(TARGET, "dagger", start_from=tmp_path, steps=100, out=tmp_path / "run")
     assert not (tmp_path / "run").exists()

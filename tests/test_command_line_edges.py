@@ -85,6 +85,8 @@ def test_dates_and_booleans_in_suites_are_refused_by_name(capsys, tmp_path, line
     ],
 )
 def test_dates_in_tables_of_suites_are_refused_by_name(capsys, tmp_path, table, message):
+    if "hyper = {" in table:
+        pytest.importorskip("stable_baselines3", reason="without it the training is refused for that")
     key = table[2:].split("]")[0]
     suite = tmp_path / "suite.toml"
     rest = [one for one in SUITE.splitlines() if not one.startswith(key)]

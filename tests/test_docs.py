@@ -38,7 +38,10 @@ QUICK = (
     "docs/maths/sdc.md",
     "docs/tutorial/method.md",
 )  # run by default, the others are slow
-NEEDED = {"docs/tutorial/datasets.md": ("minari", "h5py")}  # packages that a page needs to run
+NEEDED = {  # packages that a page needs to run
+    "docs/tutorial/datasets.md": ("minari", "h5py"),
+    "docs/tutorial/method.md": ("stable_baselines3",),
+}
 LANGUAGES = ("python", "bash", "toml", "csv", "text", "")  # "": text
 _FENCE = re.compile(r"^```(\w*)(?: title=\"([^\"]+)\")?\s*$")
 _MARK = re.compile(r"<!-- not run: .+ -->")

@@ -17,6 +17,8 @@ from baselines.training.policy_gradient import train as policy_gradient
 from quad_envs.observations.features import default_features
 from quad_envs.wrappers.encoding import hover_actions
 
+pytest.importorskip("torch", reason="what imitates and the gradient learn with it")
+
 HELIX, RANDOM, FORMATION = "quad/HelixTracking-v0", "quad/RandomTracking-v0", "quad/Formation-v0"
 TARGET, CORRIDOR = "quad/TargetTracking-v0", "quad/CorridorTracking-v0"
 
