@@ -194,6 +194,10 @@ def test_evaluate_discards_another_run_if_asked_to(capsys, tmp_path):
         (["evaluate", HELIX, "random", "--policy-set", "sed=1"], "did you mean 'seed'"),
         (["evaluate", HELIX, "hover", "--set", "kapa=1"], "did you mean 'kappa'"),
         (["evaluate", HELIX, "hover", "--set", "kappa=0.2"], "must lie in (1/4, 20]"),
+        (
+            ["evaluate", HELIX, "hover", "--set", "render_mode=a"],
+            "render_mode must be None or 'rgb_array', got",
+        ),
         (["evaluate", HELIX, "hover", "--set", "kappa"], "--set needs KEY=VALUE"),
         (["evaluate", HELIX, "hover", "--set", "kappa=1", "--set", "kappa=1"], "sets 'kappa' twice"),
         (["evaluate", HELIX, "hover", "--episodes", "0"], "episodes must be a whole number >= 1, got 0"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from importlib import import_module
 from typing import Any
 
@@ -43,7 +44,10 @@ def make_env(env_id: str, /, **kwargs: Any) -> Any:
         others = [known for known in gymnasium.registry if module and known.startswith(name.split("/")[0])]
         raise ValueError(unknown_name("environment id", env_id, [*TRACKING, *TEAMS, *others]))
     try:
-        return gymnasium.make(name, **kwargs)
+        with warnings.catch_warnings():
+            if name in TRACKING:  # which refuse such a mode themselves
+                warnings.filterwarnings("ignore", ".*not in the possible render_modes", UserWarning)
+            return gymnasium.make(name, **kwargs)
     except TypeError as error:  # Gymnasium repeats all arguments behind the environment's own message
         raise ValueError(str(error.__cause__ or error)) from error
 
