@@ -22,21 +22,13 @@ _SHIM, _OWN_SHIM = "https://unpkg.com/iframe-worker/shim", "vendor/iframe-worker
 
 def columns_table() -> str:
     """The columns of the tables of evaluations, as Markdown."""
-    from baselines.evaluation.column import CUT_SHORT, REPORTED, SINGLE, TEAM, WORST
     from baselines.evaluation.columns import COLUMNS
 
     lines = ["| column | on the page | unit | |", "|---|---|---|---|"]
     for name, column in COLUMNS.items():
-        notes = [
-            column.about.replace("|", r"\|"),
-            *["empty after a crash"] * column.has(CUT_SHORT),
-            *["teams only"] * column.has(TEAM),
-            *["behind a safety filter only"] * column.has(REPORTED),
-            *["not in tables of teams"] * column.has(SINGLE),
-            *[f"`{column.worst().name}` is that of the worst vehicle"] * column.has(WORST),
-        ]
+        notes = "; ".join(column.notes).replace("|", r"\|")
         if column.source in ("", name):
-            lines.append(f"| `{name}` | {column.title} | {column.unit} | {'; '.join(notes)} |")
+            lines.append(f"| `{name}` | {column.title} | {column.unit} | {notes} |")
     return "\n".join(lines)
 
 

@@ -22,7 +22,10 @@ from baselines.__main__ import COMMANDS, main
 from baselines.cli.commands import _resume
 from baselines.cli.options import BenchmarkOptions, read_assignments
 from baselines.cli.values import read_value
+from baselines.evaluation.columns import COLUMNS
 from baselines.policies.registry import TEAM_POLICIES, TRACKING_POLICIES, policy_comments, policy_options
+from baselines.policies.trained import SHIPPED
+from baselines.policies.tuned import TunedPolicy, write_tuned
 from baselines.sweeps.sweep import REPORTED
 from quad_envs import __version__
 from quad_envs.registration import TEAMS, TRACKING
@@ -215,6 +218,7 @@ def test_evaluate_discards_another_run_if_asked_to(capsys, tmp_path):
         (["benchmark", "quik"], "unknown suite 'quik'; did you mean 'quick'"),
         (["benchmark", "quick", "--engine", "processe"], "did you mean 'processes'"),
         (["list", "hovr"], "did you mean 'hover'"),
+        (["evaluate", HELIX, "LMPC"], "unknown policy 'LMPC'; did you mean 'lmpc'"),
         (["evaluate", "quad/Formation", "hover"], "did you mean 'quad/Formation-v0'"),
         (["evaluate", "quad/Formation-v0", "hover", "--set", "grph=weak"], "did you mean 'graph'"),
         (["evaluate", "quad/Formation-v0", "lmpc"], "for tracking tasks, not for formation"),
@@ -306,6 +310,29 @@ def test_every_name_of_the_list_can_be_listed(capsys):
     assert main(["list", "--json"]) == 0
     for name in {name for shelf in json.loads(capsys.readouterr().out).values() for name in shelf}:
         assert main(["list", name]) == 0, name
+
+
+def test_list_says_what_columns_are(capsys):
+    assert main(["list", "columns", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert list(said) == list(COLUMNS) and all(said.values())
+    assert main(["list", "steady_rms", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"steady_rms": said["steady_rms"]}
+    assert said["steady_rms"].startswith("m; ")
+
+
+def test_list_says_what_the_folder_of_a_trained_or_tuned_policy_is(capsys, tmp_path):
+    tuned = TunedPolicy("lmpc", {"R": 2.0}, HELIX, {"mass": 0.8})
+    write_tuned(tmp_path, tuned, {"score": 0.5, "updates": 3})
+    assert main(["list", str(tmp_path), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said == {"env_id": HELIX, **tuned._asdict(), "score": 0.5}
+    assert main(["list", str(SHIPPED / "ppo-helix"), "--json"]) == 0
+    trained = json.loads(capsys.readouterr().out)
+    assert main(["list", "ppo-helix", "--json"]) == 0
+    assert trained == json.loads(capsys.readouterr().out) and trained["algorithm"] == "ppo"
+    (tmp_path / "empty").mkdir()
+    assert "cannot read policy.json" in fails(capsys, "list", str(tmp_path / "empty"))
 
 
 def test_version_is_that_of_the_package(capsys):

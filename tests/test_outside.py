@@ -193,6 +193,7 @@ def test_objects_and_factories_are_policies_wherever_a_name_is(theirs):
     ("name", "said"),
     [
         ("nowhere:make", r"there is no module 'nowhere', neither in '.*' nor installed"),
+        ("nowhere.py:make", r"there is no module .*; a module is named without \.py: nowhere$"),
         ("their_policy:mak", "no 'mak'; did you mean 'make'"),
         ("their_policy:number", "is int 3: a policy has predict, and a factory makes one"),
         ("their_policy:returns_a_number", "returned int, which has no predict"),
@@ -208,6 +209,23 @@ def test_a_factory_that_cannot_be_used_is_named_with_the_line_of_its_file(theirs
     (folder / "broken_exit.py").write_text("raise SystemExit(4)\n")
     with pytest.raises(PolicyError, match=f"policy '{name}'.*{said}"):
         make_policy(name, HELIX)
+
+
+@pytest.mark.parametrize("command", [("evaluate", HELIX), ("list",)])
+def test_a_file_that_is_named_as_a_policy_gets_told_how_its_policies_are_named(theirs, capsys, command):
+    assert main([*command, "their_policy"]) == 2
+    assert "'their_policy'; their_policy.py is here: what it has is named their_policy:NAME" in (
+        capsys.readouterr().err
+    )
+    assert main([*command, "their_polici"]) == 2
+    assert "is here" not in capsys.readouterr().err
+
+
+def test_names_that_a_file_has_are_told_without_the_modules_that_it_imports(theirs):
+    with pytest.raises(PolicyError) as refused:
+        make_policy("their_policy:nothing_like_it", HELIX)
+    known = str(refused.value).partition("known: ")[2].split(", ")
+    assert "make" in known and "np" in vars(theirs) and "np" not in known
 
 
 def test_the_line_is_where_it_happened(theirs):
@@ -376,6 +394,18 @@ def test_an_environment_is_named_by_module_and_id(folder, capsys):
     ):
         assert main(["evaluate", wrong, "lqr"]) == 2
         assert said in capsys.readouterr().err
+
+
+def test_list_shows_the_options_of_an_environment_named_by_module_and_id(folder, capsys):
+    assert main(["list", "their_env:lab/Eight-v0", "--json"]) == 0
+    values = json.loads(capsys.readouterr().out)
+    registered = gym.spec("lab/Eight-v0").kwargs
+    assert values["preview"] == 25 and registered["env_id"] == "lab/Eight-v0" and "env_id" not in values
+    assert values["reference"] == registered["reference"] != "helix"
+    assert main(["list", f"quad_envs:{HELIX}", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["reference"] == "helix"
+    assert main(["list", "their_env:lab/Ate-v0"]) == 2
+    assert "did you mean 'lab/Eight-v0'" in capsys.readouterr().err
 
 
 def test_the_options_of_an_environment_named_by_module_and_id_are_those_it_is_registered_with(theirs):

@@ -164,7 +164,7 @@ def test_a_privileged_policy_gets_the_truth_as_one_row_and_is_marked():
     found = evaluate(policy, env, 1)
     assert all(row.shape == (1, env.state().size) for row in policy.seen)
     np.testing.assert_array_equal(policy.seen[-1][0, :16][6:9], 0.0)  # hover keeps the leader level
-    assert str(found).startswith("omniscient (privileged) on quad/Formation-v0, 1 flights of 6 vehicles")
+    assert str(found).startswith("omniscient (privileged) on quad/Formation-v0, 1 flight of 6 vehicles")
     told = found.to_dict()
     assert told["policy"] == "omniscient (privileged)" and told["privileged"] is True
     with pytest.raises(ValueError, match="fly it in a ParallelEnv"):

@@ -202,6 +202,21 @@ def test_episode_is_truncated_at_the_time_limit():
     assert ends == [(False, False)] * 19 + [(False, True)]
 
 
+def test_a_step_after_the_end_flies_on_and_judges_the_present_state_alone():
+    env = make(time_limit=0.1)
+    env.reset(seed=0)
+    ends = [env.step(np.zeros(4, np.float32))[2:4] for _ in range(4)]
+    assert ends == [(False, False), *[(False, True)] * 3]
+    env = make(start_box=0.0, lost_distance=3.0, start="reference", reference=(0.0, 0.0, 0.0))
+    env.reset(seed=0, options={"state": [0, 0, -2.9, 0, 0, -1, 0, 0, 0, 0, 0, 0]})
+    steps = [env.step(np.full(4, -0.5, np.float32)) for _ in range(40)]
+    crashed = [terminated for _, _, terminated, _, _ in steps]
+    first = crashed.index(True)
+    assert not all(crashed[first:])  # it comes back
+    for _, reward, terminated, _, info in steps:
+        assert (reward == 0.0) == terminated == info["crashed"]
+
+
 def test_a_state_can_be_given_at_reset():
     env = make()
     state = np.arange(12) / 20

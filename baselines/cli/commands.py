@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import sys
 import warnings
@@ -14,7 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from quad_envs.arguments.names import shortened, unknown_name
+from quad_envs.arguments.names import shortened, shown, unknown_name
 
 from ..interruptions import exit_code, raise_lost
 from .options import BenchmarkOptions, EvaluateOptions, ListOptions, read_assignments
@@ -79,7 +80,7 @@ def list_names(options: ListOptions) -> int:
             text = entry if isinstance(entry, str) else ", ".join(f"{k}={v!r}" for k, v in entry.items())
             print(f"  {name:29} {text}")
     print("\nquad-envs list NAME shows the options of an environment, a policy or a training algorithm,")
-    print("and what a vehicle, a trained policy or a suite is")
+    print("and what a vehicle, a trained policy or a suite is; quad-envs list columns what tables say")
     print("safe:NAME puts a safety filter in front of any policy for one vehicle")
     return 0
 
@@ -134,6 +135,7 @@ def _list_options(options: ListOptions) -> int:
     from dataclasses import fields
 
     from quad_envs.arguments.field_comments import field_comments
+    from quad_envs.envs.tracking.options import TrackingOptions
     from quad_envs.registration import TEAMS, TRACKING
 
     from ..policies.outside import installed_policies
@@ -148,16 +150,16 @@ def _list_options(options: ListOptions) -> int:
     from ..training.algorithms import ALGORITHMS, options_of
     from ..training.hyperparameters import hyperparameters, plain_options
 
+    env_id = options.name.rpartition(":")[-1]
     names = [*TRACKING, *TEAMS, *TRACKING_POLICIES, *TEAM_POLICIES, *installed_policies(), *ALGORITHMS]
     comments: dict[str, str] = {}
     flag = title = ""
-    if options.name in (*TRACKING, *TEAMS):
-        if options.name in TEAMS:
-            kind = import_module(TEAMS[options.name]).raw_env.options_type
-        else:
-            from quad_envs.envs.tracking.options import TrackingOptions as kind
+    if env_id in (*TRACKING, *TEAMS):
+        kind = TrackingOptions
+        if env_id in TEAMS:
+            kind = import_module(TEAMS[env_id]).raw_env.options_type
         values = {entry.name: entry.default for entry in fields(kind) if entry.init}
-        values |= TRACKING.get(options.name, {})
+        values |= TRACKING.get(env_id, {})
         del values["env_id"]
         flag, comments = "--set", field_comments(kind)
     elif options.name in ALGORITHMS:
@@ -166,6 +168,8 @@ def _list_options(options: ListOptions) -> int:
     elif options.name in names or behind_filter(options.name) != options.name or from_outside(options.name):
         values, flag = policy_options(options.name), "--policy-set"
         comments = policy_comments(options.name)
+    elif ":" in options.name:
+        values, flag, comments = _own_env_options(options.name), "--set", field_comments(TrackingOptions)
     else:
         values, title = _without_options(options.name, names)
     if options.json:
@@ -178,8 +182,28 @@ def _list_options(options: ListOptions) -> int:
     return 0
 
 
+def _own_env_options(name: str) -> dict[str, Any]:
+    """Options of an environment of the user's, `module:id`, with the arguments that it is registered with.
+
+    Raises:
+        ValueError: If there is none of this name, or it is not one of this suite with other arguments.
+    """
+    from dataclasses import fields
+
+    from quad_envs.envs.tracking.options import TrackingOptions
+
+    from ..policies.environments import make_env, task_of
+
+    env = make_env(name)
+    task_of(env)
+    known = {entry.name: entry.default for entry in fields(TrackingOptions) if entry.init}
+    values = known | dict(env.unwrapped.spec.kwargs)
+    del values["env_id"]
+    return values
+
+
 def _without_options(name: str, known: list[str]) -> tuple[dict[str, Any], str]:
-    """What is known of a vehicle, a trained policy or a suite, and a title.
+    """What is known of a vehicle, a trained policy, a suite or a column of the tables, and a title.
 
     Args:
         name: Of it.
@@ -190,7 +214,9 @@ def _without_options(name: str, known: list[str]) -> tuple[dict[str, Any], str]:
     """
     from quad_envs.vehicles import VEHICLES
 
-    from ..policies.trained import describe_shipped, shipped_policies
+    from ..evaluation.columns import COLUMNS
+    from ..policies.outside import named_in_file
+    from ..policies.trained import describe_folder, describe_shipped, shipped_policies
     from ..sweeps.suite_files import load_suite, suite_names
 
     if name in VEHICLES:
@@ -209,6 +235,17 @@ def _without_options(name: str, known: list[str]) -> tuple[dict[str, Any], str]:
         numbers = {"episodes": suite.episodes, "seed": suite.seed}
         values = {key: value for key, value in titles.items() if value} | numbers
         return values, f"quad-envs benchmark {name} flies this"
+    if name == "columns" or name in COLUMNS:
+        chosen = COLUMNS.values() if name == "columns" else [COLUMNS[name]]
+        about = {column.name: "; ".join(filter(None, (column.unit, *column.notes))) for column in chosen}
+        return about, "columns of the tables, each with its unit and what it says"
+    if os.path.isdir(name):
+        said = describe_folder(name)
+        where = said.get("env_id", "ENV")
+        return said, f"{name} has no options; it flies with quad-envs evaluate {where} {shlex.quote(name)}"
+    in_file = named_in_file(name)
+    if in_file:
+        raise ValueError(f"unknown name {shown(name)}; {in_file}")
     every = dict.fromkeys((*known, *VEHICLES, *shipped_policies(), *suite_names()))
     raise ValueError(unknown_name("name", name, every))
 

@@ -70,8 +70,8 @@ class ListOptions:
     name: Annotated[
         str,
         Positional(
-            "environment, policy or training algorithm, to see its options; or a vehicle, a trained policy "
-            "or a suite, to see what it is"
+            "environment, policy or training algorithm, to see its options; or a vehicle, a trained policy, "
+            "a suite or a column of the tables, or `columns`, to see what it is"
         ),
     ] = ""
     json: Json = False

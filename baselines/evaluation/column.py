@@ -76,6 +76,18 @@ class Column:
         """Of a printed table."""
         return " ".join(filter(None, (self.printed, "%" if self.has(PERCENT) else self.unit)))
 
+    @property
+    def notes(self) -> list[str]:
+        """What it says, and where it has numbers."""
+        return [
+            self.about,
+            *["empty after a crash"] * self.has(CUT_SHORT),
+            *["teams only"] * self.has(TEAM),
+            *["behind a safety filter only"] * self.has(REPORTED),
+            *["not in tables of teams"] * self.has(SINGLE),
+            *[f"`{self.name}_worst` is that of the worst vehicle"] * self.has(WORST),
+        ]
+
     def of_team(self, values: Sequence[float]) -> float:
         """The number of a flight from those of its vehicles, nan where they have none."""
         if len(values) == 1 and not self.has(LEAST | LARGEST):

@@ -68,7 +68,11 @@ class Record(NamedTuple):
     steady_rms: Annotated[
         float,
         Column(
-            "Steady RMS", "m", "over the second half of the time limit", LESS | SINGLE | CUT_SHORT, "steady"
+            "Steady RMS",
+            "m",
+            "distance to the reference in the second half of the time limit",
+            LESS | SINGLE | CUT_SHORT,
+            "steady",
         ),
     ]
     settling_time: Annotated[
@@ -85,7 +89,11 @@ class Record(NamedTuple):
     formation_final: Annotated[
         float,
         Column(
-            "Final error", "m", "that distance in the last second", LESS | TEAM | CUT_SHORT | WORST, "final"
+            "Final error",
+            "m",
+            "distance to the own slot in the last second",
+            LESS | TEAM | CUT_SHORT | WORST,
+            "final",
         ),
     ]
     formation_settling: Annotated[
@@ -100,7 +108,13 @@ class Record(NamedTuple):
     ]
     z_error_max: Annotated[
         float,
-        Column("Height error", "m", "largest to the slot", LESS | TEAM | CUT_SHORT | LARGEST, "z max"),
+        Column(
+            "Height error",
+            "m",
+            "largest height error to the slot",
+            LESS | TEAM | CUT_SHORT | LARGEST,
+            "z max",
+        ),
     ]
     z_error_rms: Annotated[
         float, Column("Height RMS", "m", "height error to the slot", LESS | TEAM | CUT_SHORT | UNSEEN)
@@ -116,12 +130,26 @@ class Record(NamedTuple):
     ]
     estimate_sigma: Annotated[
         float,
-        Column("Believed error", "m", "root mean trace of that position's covariance", TEAM | CUT_SHORT),
+        Column(
+            "Believed error", "m", "root mean trace of the estimated position's covariance", TEAM | CUT_SHORT
+        ),
     ]  # as the policy believes
     anees: Annotated[
-        float, Column("ANEES", "", "mean e' P^-1 e / 3 of it, 1 for an honest filter", TEAM, "ANEES")
+        float,
+        Column(
+            "ANEES", "", "mean e' P^-1 e / 3 of the estimated position, 1 for an honest filter", TEAM, "ANEES"
+        ),
     ]
-    nis_ratio: Annotated[float, Column("NIS", "", "per row, 1 for an honest filter", TEAM, "NIS")]
+    nis_ratio: Annotated[
+        float,
+        Column(
+            "NIS",
+            "",
+            "squared innovation over its covariance, mean per number measured, 1 for an honest filter",
+            TEAM,
+            "NIS",
+        ),
+    ]
     trilateration_share: Annotated[
         float,
         Column("Trilaterated", "", "share of updates by a trilaterated position", TEAM | PERCENT | UNSEEN),
@@ -187,13 +215,13 @@ class Record(NamedTuple):
         ),
     ]  # nan if not timed
     decision_p99_ms: Annotated[
-        float, Column("Decision p99", "ms", "its 99th percentile", LESS | TIMED, "p99")
+        float, Column("Decision p99", "ms", "the same, 99th percentile", LESS | TIMED, "p99")
     ]
     decision_max_ms: Annotated[
         float,
         Column("Decision max", "ms", "the slowest", LESS | TIMED | UNSEEN),
         Column("Team p50", "ms", "of a decision for the whole team", LESS | TEAM, "team p50", "team_p50_ms"),
-        Column("Team p99", "ms", "its 99th percentile", LESS | TEAM, "team p99", "team_p99_ms"),
+        Column("Team p99", "ms", "the same, 99th percentile", LESS | TEAM, "team p99", "team_p99_ms"),
     ]
     relaxed: Annotated[
         int, Column("Relaxed", "", "decisions whose hard rows were made soft", LESS | FALLBACK | UNSEEN)

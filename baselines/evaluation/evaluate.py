@@ -165,7 +165,8 @@ class Evaluation:
         counts = totals(self.records).items()
         counted = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counts)
         of_team = f" of {self.vehicles} vehicles" if has_team(self.records) else ""
-        title = f"{self.title} on {self.env_id}, {self.flights} flights{of_team} from seed {self.seed}"
+        flights = f"{self.flights} flight{'s' * (self.flights != 1)}{of_team}"
+        title = f"{self.title} on {self.env_id}, {flights} from seed {self.seed}"
         notes = (f"note: {note}" for note in self.notes)
         lines = [f"decisions: {_times(self.decision_ms)}" + (" per vehicle" if of_team else "")]
         if of_team:

@@ -60,8 +60,9 @@ def import_named(module: str, what: str) -> Any:
             and error.name
             and f"{module}.".startswith(f"{error.name}.")
         ):
+            named = f"; a module is named without .py: {module[:-3]}" if module.endswith(".py") else ""
             raise PolicyError(
-                f"{what}: there is no module {error.name!r}, neither in {os.getcwd()!r} nor installed"
+                f"{what}: there is no module {error.name!r}, neither in {os.getcwd()!r} nor installed{named}"
             ) from error
         raise PolicyError(f"{what} cannot be imported: {_said(error)}") from error
 
@@ -80,7 +81,11 @@ def find_source(source: Any) -> tuple[Any, str]:
         found = module = import_named(module_name, what)
         for attribute in path.split("."):
             if not hasattr(found, attribute):
-                public = [name for name in vars(found) if not name.startswith("_")]
+                public = [
+                    name
+                    for name, value in vars(found).items()
+                    if not (name.startswith("_") or inspect.ismodule(value))
+                ]
                 where = getattr(module, "__file__", None) or module_name
                 raise PolicyError(f"{what}: {where} has no {attribute!r}; {suggestion(attribute, public)}")
             found = getattr(found, attribute)
@@ -90,6 +95,17 @@ def find_source(source: Any) -> tuple[Any, str]:
             "from a task"
         )
     return found, what
+
+
+def named_in_file(name: str) -> str:
+    """How policies in a file here are named, where `name` is that of the file; "" where it is not."""
+    module = name.removesuffix(".py")
+    if not (re.fullmatch(r"\w+", module) and os.path.isfile(f"{module}.py")):
+        return ""
+    return (
+        f"{module}.py is here: what it has is named {module}:NAME, which is a class, a function that makes a "
+        "policy, or an object with predict"
+    )
 
 
 def is_policy(found: Any) -> bool:

@@ -16,7 +16,7 @@ from quad_envs.arguments.kinds import holds_booleans, is_limit
 from quad_envs.arguments.names import shown, unknown_name
 
 from ..errors import CheckpointError
-from .outside import build, installed_policies, is_outside, names_factory, outside_options
+from .outside import build, installed_policies, is_outside, named_in_file, names_factory, outside_options
 from .protocol import Policy
 from .trained import load_policy, names_trained, shipped_policies
 from .tuned import DESCRIPTION, names_tuned, read_tuned
@@ -167,6 +167,9 @@ def policy_entry(name: str, mission: str | None = None) -> PolicyEntry:
     if name not in known:
         able = known if mission is None else serving(mission)
         names = [*able, *shipped_policies(), *installed_policies()]
+        in_file = named_in_file(name)
+        if in_file:
+            raise ValueError(f"unknown policy {shown(name)}; {in_file}")
         raise ValueError(
             unknown_name("policy", name, names)
             + ", the folder of a trained one, or module:factory of your own"

@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # not at run time: tasks load numba, and `quad-envs list` has
 
 SHIPPED = Path(__file__).parent / "shipped"  # one checkpoint per folder, as "apg-helix"
 _DESCRIPTION = "policy.json"
+_TOLD = ("env_id", "env_kwargs", "algorithm", "kind", "score")
 
 
 def shipped_policies() -> dict[str, str]:
@@ -33,7 +34,22 @@ def shipped_policies() -> dict[str, str]:
 def describe_shipped(name: str) -> dict[str, Any]:
     """How a shipped policy was made, and where: what its description says, without layers and features."""
     said = json.loads((SHIPPED / name / _DESCRIPTION).read_text(encoding="utf-8"))
-    return {key: said[key] for key in ("env_id", "env_kwargs", "algorithm", "kind", "score") if key in said}
+    return {key: said[key] for key in _TOLD if key in said}
+
+
+def describe_folder(folder: str) -> dict[str, Any]:
+    """The same of the policy in a folder, which is a tuned one or a checkpoint.
+
+    Raises:
+        CheckpointError: If it is neither.
+    """
+    from .checkpoints import load_checkpoint
+    from .tuned import describe_tuned, names_tuned
+
+    if names_tuned(folder):
+        return describe_tuned(folder)
+    said = load_checkpoint(folder)[1]
+    return {key: said[key] for key in _TOLD if key in said}
 
 
 def _describe(path: Path) -> str:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # not at run time: tasks load numba
 
 DESCRIPTION = "tuned.json"
 FORMAT = 1
+_TOLD = ("env_id", "env_kwargs", "policy", "options", "vehicle", "objective", "score")
 
 
 class TunedPolicy(NamedTuple):
@@ -63,17 +64,7 @@ def read_tuned(folder: str | os.PathLike[str], task: BaseTask) -> TunedPolicy:
         CheckpointError: If it is none, or was tuned for another task or vehicle.
     """
     where = f"tuned policy {os.fspath(folder)!r}"
-    try:
-        said = json.loads(Path(folder, DESCRIPTION).read_text(encoding="utf-8"))
-        if said["format"] != FORMAT:
-            raise ValueError(f"format {shown(said['format'])}, this version reads {FORMAT}")
-        found = TunedPolicy(
-            str(said["policy"]), dict(said["options"]), str(said["env_id"]), dict(said["vehicle"])
-        )
-    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-        raise CheckpointError(
-            f"{where}: cannot read {DESCRIPTION} ({error!r}); tune again with quad-envs tune"
-        ) from error
+    found, _ = _read(folder, where)
     again = f"tune one for it: quad-envs tune {task.env_id} {found.policy}"
     if found.env_id != task.env_id:
         raise CheckpointError(f"{where} is for {found.env_id}, not for {task.env_id}; {again}")
@@ -86,3 +77,29 @@ def read_tuned(folder: str | os.PathLike[str], task: BaseTask) -> TunedPolicy:
             f"{shown(here[name])}; {again} with this vehicle"
         )
     return found
+
+
+def describe_tuned(folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """How a tuned policy was found, and where: what its description says that matters to who flies it.
+
+    Raises:
+        CheckpointError: If it cannot be read.
+    """
+    _, said = _read(folder, f"tuned policy {os.fspath(folder)!r}")
+    return {key: said[key] for key in _TOLD if key in said}
+
+
+def _read(folder: str | os.PathLike[str], where: str) -> tuple[TunedPolicy, dict[str, Any]]:
+    """A tuned policy, and the whole of its description."""
+    try:
+        said = json.loads(Path(folder, DESCRIPTION).read_text(encoding="utf-8"))
+        if said["format"] != FORMAT:
+            raise ValueError(f"format {shown(said['format'])}, this version reads {FORMAT}")
+        found = TunedPolicy(
+            str(said["policy"]), dict(said["options"]), str(said["env_id"]), dict(said["vehicle"])
+        )
+    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        raise CheckpointError(
+            f"{where}: cannot read {DESCRIPTION} ({error!r}); tune again with quad-envs tune"
+        ) from error
+    return found, said

@@ -99,7 +99,7 @@ class Suite:
             for kind, names in known.items():
                 for name in getattr(choice, kind, ()):
                     if name not in names:
-                        what = f"{singular[kind]} of {who} in suite {self.name!r}"
+                        what = f"{singular[kind]} of {who} in suite {self.name!r}:"
                         raise ValueError(unknown_name(what, name, names))
 
     def _check_flown(self) -> None:

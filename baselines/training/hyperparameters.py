@@ -50,7 +50,7 @@ def hyperparameters(algorithm: str, env_id: str, overrides: Mapping[str, Any] | 
     kind, tables = options_of(algorithm), hyperparameter_file(algorithm)
     values: dict[str, Any] = {}
     sources = [(f"[{name}] of {algorithm}.toml", tables.get(name, {})) for name in ("default", env_id)]
-    for source, table in (*sources, ("given", overrides or {})):
+    for source, table in (*sources, ("your choice", overrides or {})):
         values |= {name: _checked(kind, algorithm, name, value, source) for name, value in table.items()}
     try:
         return kind(**values)

@@ -46,9 +46,10 @@ def shortened(text: str) -> str:
 
 
 def nearest_name(name: object, known: Iterable[str], like: float = _LIKE) -> str | None:
-    """The known name that this is a slip of, at least `like` it, 0 to 1, or of which alone it is a part."""
+    """The known name that this is in other capitals, a slip of, at least `like` it, or alone a part of."""
     text, names = str(name)[:100], list(known)
-    near = difflib.get_close_matches(text, names, n=1, cutoff=like)
+    near = [one for one in names if one.lower() == text.lower()]
+    near = near or difflib.get_close_matches(text, names, n=1, cutoff=like)
     if not near and len(text) >= _PART:
         near = [one for one in names if text.lower() in one.lower()]
     return near[0] if len(near) == 1 else None
