@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from sources import ROOT, reads_sources
 
-from baselines import EstimateWrapper, PolicyCheckError, check_policy, evaluate, make_policy
+from baselines import EstimateWrapper, PolicyCheckError, check_policy, evaluate, make_policy, run_benchmark
 from baselines.policies.pairing import JUDGED_ONLY
 from quad_envs import formation_v0, target_tracking_v0
 
@@ -46,6 +46,18 @@ def test_wrappers_that_leave_the_numbers_alone_change_no_score(wrap):
     plain = evaluate("lqr", env, episodes=1).records[0]
     wrapped = evaluate(make_policy("lqr", env), wrap(env), episodes=1).records[0]
     assert wrapped.position_rms == plain.position_rms
+
+
+@pytest.mark.parametrize("env_id", [HELIX, FORMATION])
+def test_whole_numbers_of_numpy_are_as_good_as_pythons(env_id, tmp_path):
+    def told(found):
+        return type(found.seed), [(record.seed, record.score) for record in found.records]
+
+    plain = told(evaluate("hover", env_id, episodes=2, seed=3))
+    for number in (np.int64, np.uint8):
+        assert told(evaluate("hover", env_id, episodes=number(2), seed=number(3))) == plain
+    suite = {"envs": [{"id": env_id}], "policies": ["hover"], "episodes": np.int64(2), "seed": np.int64(3)}
+    assert told(run_benchmark(suite, tmp_path / "run").evaluations[0])[1] == plain[1]
 
 
 def test_evaluate_takes_the_name_of_a_policy():

@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import re
 from dataclasses import dataclass, fields
 
 import pytest
@@ -11,7 +12,7 @@ from baselines import ResultsError, train
 from baselines.__main__ import main
 from baselines.policies.checkpoints import load_checkpoint
 from baselines.policies.trained import SHIPPED
-from baselines.training.algorithm_options import PpoOptions, SacOptions
+from baselines.training.algorithm_options import PpoOptions, SacOptions, check_sizes
 from baselines.training.algorithms import ALGORITHMS, options_of
 from baselines.training.former_names import _TODAY, name_of_today
 from baselines.training.hyperparameters import hyperparameters, recorded_hyperparameters
@@ -111,7 +112,7 @@ def test_sac_takes_what_its_options_say(sb3):
 
     options = SacOptions(
         n_envs=4, train_freq=2, gradient_steps=3, batch_size=16, buffer_size=1000, learning_starts=20,
-        gamma=0.9, tau=0.02, ent_coef=0.1, net_arch=(8,),
+        gamma=0.9, tau=0.02, ent_coef=0.1, net_arch=(8,), n_critics=3, log_std_init=-1.5,
     )  # fmt: skip
     flights = make_flights(TrackingOptions.from_kwargs({}), options, 0, None)
     model = make_sac(flights, options, 0, lambda: 0.0)
@@ -120,6 +121,35 @@ def test_sac_takes_what_its_options_say(sb3):
     for name in same - {"learning_rate", "train_freq"}:
         assert getattr(model, name) == getattr(options, name), name
     assert model.train_freq.frequency == 2 and model.policy.net_arch == [8]
+    assert len(model.critic.q_networks) == 3
+    observations = sb3.common.utils.obs_as_tensor(flights.reset(), "cpu")
+    log_std = model.actor.get_action_dist_params(observations)[1]
+    assert abs(log_std.detach().numpy() + 1.5).max() < 0.2
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "name", "value", "message"),
+    [
+        ("ppo", "log_std_init", float("nan"), "must lie in -20 to 20, got nan"),
+        ("mappo", "start_log_std", 20.5, "must lie in -20 to 20, got 20.5"),
+        ("sac", "log_std_init", -float("inf"), "must lie in -20 to 20, got -inf"),
+        ("sac", "n_critics", 0, "must be finite and > 0, got 0"),
+        ("sac", "n_critics", 1.5, "must be a whole number, got 1.5"),
+    ],
+)
+def test_a_number_that_no_learner_can_take_is_refused(algorithm, name, value, message):
+    with pytest.raises(ValueError, match=f"{name}.* {re.escape(message)}"):
+        hyperparameters(algorithm, "quad/Formation-v0" if algorithm == "mappo" else HELIX, {name: value})
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "name", "said"),
+    [("ppo", "n_epochs", "got 1000000000$"), ("ppo", "n_envs", "which would take about .* GiB of memory$")],
+)
+def test_of_what_takes_time_no_memory_is_told(algorithm, name, said):
+    options = hyperparameters(algorithm, HELIX, {name: 10**9})
+    with pytest.raises(ValueError, match=f"hyperparameter {name} must be a whole number from 1 to .*{said}"):
+        check_sizes(options, 226)
 
 
 @pytest.mark.parametrize("weight", [-0.1, float("nan"), "automatic", "auto_", "auto_0.0", "0.1"])

@@ -178,6 +178,13 @@ def test_a_folder_with_a_run_is_not_overwritten_unasked(tmp_path):
         run(tmp_path, seed=1, hyper={"gain": 2.0}, resume=True)
 
 
+def test_a_training_takes_whole_numbers_of_numpy(tmp_path):
+    hyper = {"gain": np.float32(0.5)}
+    train(HELIX, "stub", seed=np.int64(4), steps=np.int64(200), hyper=hyper, out=tmp_path / "run")
+    said = json.loads((tmp_path / "run" / "policy.json").read_text())
+    assert said["seed"] == 4 and said["hyperparameters"]["gain"] == 0.5
+
+
 def test_files_of_others_are_left_alone(tmp_path):
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(ResultsError, match="no training has written"):

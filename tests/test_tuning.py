@@ -194,6 +194,7 @@ def test_a_violation_or_a_crash_costs_more_than_any_score():
     ("changes", "message"),
     [
         ({"episodes": 1}, r"a tuning of 1 episode cannot compare anything: .* --episodes 32 or more"),
+        ({"episodes": np.int64(2)}, r"a tuning of 2 episodes cannot compare anything"),
         ({"objective": "reward"}, "objective must be .*'score'.*'quadratic_cost'.*'reward'"),
         ({"fields": ("Qq",)}, "did you mean 'Q'"),
         ({"seconds": 0.0}, "seconds of a tuning must be a number > 0, got 0.0"),

@@ -232,9 +232,10 @@ def fly_and_measure(
     name = policy if isinstance(policy, str) else ""
     policy = policy if is_policy(policy) else make_policy(policy, env)
     check_flights(policy, env, episodes, seed, mismatch)
+    episodes, seed = int(episodes), int(seed)  # numpy's whole numbers are no seeds of Gymnasium
     if has_row_form(policy, env):
         timed = time_decisions(policy, env, seed) if timed is None else timed
-        flights = with_times(_side_by_side(policy, env, int(episodes), seed), seed, timed)
+        flights = with_times(_side_by_side(policy, env, episodes, seed), seed, timed)
     else:
         timed, flights = None, run_episodes(policy, env, episodes, seed, mismatch=mismatch)
     records, times = [], []

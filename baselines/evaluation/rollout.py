@@ -63,7 +63,7 @@ def run_episodes(
             or an action is not finite, with the row, its seed and the step.
     """
     check_flights(policy, env, episodes, seed, mismatch)
-    return _episodes(policy, env, int(episodes), seed)
+    return _episodes(policy, env, int(episodes), int(seed))
 
 
 def check_flights(policy: Policy, env: Any, episodes: int, seed: int, mismatch: bool) -> None:

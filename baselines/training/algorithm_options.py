@@ -22,11 +22,12 @@ _POSITIVE = (
     *("n_envs", "n_steps", "progress_steps", "batch_size", "n_epochs", "learning_rate", "final_rate"),
     *("gamma", "clip_range", "max_grad_norm", "command_range", "train_freq", "gradient_steps"),
     *("buffer_size", "tau", "probes", "start_learning_rate", "final_n_steps", "substeps", "epsilon"),
-    *("final_epsilon", "threshold"),
+    *("final_epsilon", "threshold", "n_critics"),
 )
 # Hyperparameters that take memory or time, and the largest that make sense.
 _MOST = {
     **dict.fromkeys(("n_envs", "probes"), 100_000),
+    "n_critics": 100,
     **dict.fromkeys(("n_steps", "final_n_steps", "progress_steps", "train_freq"), 10_000),
     "n_epochs": 1_000,
     "substeps": 64,
@@ -35,10 +36,12 @@ _MOST = {
     "buffer_size": 100_000_000,
     "learning_starts": 1_000_000_000,
 }
+_KEPT = ("n_envs", "probes", "n_steps", "final_n_steps", "batch_size", "buffer_size")  # observations
 _MAY_BE_NONE = ("gradient_steps", "final_gradient_steps", "critic_updates", "learning_starts")
 _WIDEST, _MOST_LAYERS = 10_000, 20
 _SHARES = ("free", "final_rate", "gamma", "gae_lambda", "tau", "command_range", "expert_flies")
 _WEIGHTS = ("vf_coef", "penalty")  # that may be zero
+_LOGARITHMS, _LARGEST_LOGARITHM = ("log_std_init", "start_log_std"), 20
 _AUTO = re.compile(r"auto(_(?=[0-9.]*[1-9])[0-9]*\.?[0-9]+(e-?[0-9]+)?)?")
 
 
@@ -152,17 +155,19 @@ class PpoLagrangianOptions(PpoOptions):
 class SacOptions:
     """Hyperparameters of SAC."""
 
-    n_envs: int = 64  # flights at once
+    n_envs: int = 16  # flights at once
     train_freq: int = 1  # steps of each flight between updates
     gradient_steps: int = 4  # of an update
     batch_size: int = 256  # samples of a gradient step
     buffer_size: int = 500_000  # steps in the replay buffer, of all flights
-    learning_starts: int = 5_000  # steps of random actions before, of all flights
-    learning_rate: float = 1e-3  # of Adam, at the beginning
+    learning_starts: int = 2_000  # steps of random actions before, of all flights
+    learning_rate: float = 2e-3  # of Adam, at the beginning
     final_rate: float = 0.1  # share of the learning rate at the end of the budget
-    gamma: float = 0.98  # discount per step
-    tau: float = 0.01  # by which the target critics follow in a gradient step
-    ent_coef: float | str = "auto_0.01"  # weight of the entropy; "auto_0.01" learns it, from 0.01
+    gamma: float = 0.95  # discount per step
+    tau: float = 0.1  # by which the target critics follow in a gradient step
+    ent_coef: float | str = 0.005  # weight of the entropy; "auto_0.01" learns it, from 0.01
+    n_critics: int = 1  # of which the least counts
+    log_std_init: float = -1.0  # log of an action's standard deviation at the start
     net_arch: tuple[int, ...] = (64, 64)  # widths of the hidden layers, of policy and critics alike
     stages: tuple[int, ...] | None = None  # of the preview that the network sees; None for FilterAndRescale's
     disturbance_estimate: bool = False  # whether the network sees an estimate of the disturbance
@@ -195,7 +200,8 @@ def check_sizes(options: Any, width: int) -> None:
         value = getattr(options, one.name)
         if value is not None and one.name in _MOST:
             least, most = int(one.name not in _MAY_BE_NONE), _MOST[one.name]
-            require_whole(f"hyperparameter {one.name}", value, least, most, lambda n: 4 * n * width)
+            memory = (lambda n: 4 * n * width) if one.name in _KEPT else None  # the others take time
+            require_whole(f"hyperparameter {one.name}", value, least, most, memory)
     for name in ("net_arch", "critic_arch"):
         layers = getattr(options, name, ())
         if len(layers) > _MOST_LAYERS:
@@ -223,6 +229,12 @@ def _check_numbers(options: PolicyGradientOptions | DaggerOptions | PpoOptions |
             raise ValueError(f"hyperparameter {name} must be finite and {least}, got {shown(value)}")
         if name in _SHARES and value > 1.0:
             raise ValueError(f"hyperparameter {name} must be at most 1, got {shown(value)}")
+    for name in {field.name for field in fields(options)} & set(_LOGARITHMS):
+        if not abs(getattr(options, name)) <= _LARGEST_LOGARITHM:
+            raise ValueError(
+                f"hyperparameter {name} must lie in -{_LARGEST_LOGARITHM} to {_LARGEST_LOGARITHM}, "
+                f"got {shown(getattr(options, name))}"
+            )
     separation = getattr(options, "separation", None)
     if separation is not None and not 0.0 < separation < math.inf:
         raise ValueError(f"hyperparameter separation must be finite and > 0 m, got {shown(separation)}")

@@ -12,7 +12,9 @@ from dataclasses import MISSING, asdict, fields
 from importlib import resources
 from typing import Any
 
-from quad_envs.arguments.kinds import is_number
+import numpy as np
+
+from quad_envs.arguments.kinds import is_number, is_whole
 from quad_envs.arguments.names import shown, unknown_name
 
 from .algorithms import ALGORITHMS, options_of
@@ -117,15 +119,14 @@ def _checked(kind: type[Any], algorithm: str, name: str, value: Any, source: str
         value = tuple(value) if fits else value
     elif isinstance(default, bool):
         fits, wanted = isinstance(value, bool), "true or false"
-    elif isinstance(default, str) and "float" in str(known[name].type):
-        fits, wanted = (
-            isinstance(value, int | float | str) and not isinstance(value, bool),
-            "a number or text",
-        )
+    elif str(known[name].type) == "float | str":
+        fits, wanted = isinstance(value, str) or _is_real(value), "a number or text"
+        value = float(value) if _is_real(value) else value
     elif isinstance(default, int):
-        fits, wanted = isinstance(value, int) and not isinstance(value, bool), "a whole number"
+        fits, wanted = is_whole(value), "a whole number"
+        value = int(value) if fits else value
     elif isinstance(default, float):
-        fits, wanted = isinstance(value, int | float) and not isinstance(value, bool), "a number"
+        fits, wanted = _is_real(value), "a number"
         value = float(value) if fits else value
     else:
         fits, wanted = isinstance(value, type(default)), "text"
@@ -135,3 +136,8 @@ def _checked(kind: type[Any], algorithm: str, name: str, value: Any, source: str
             f"default {default!r})"
         )
     return value
+
+
+def _is_real(value: Any) -> bool:
+    """Whether it is a number, finite or not; what it may be is checked with the others of its options."""
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from quad_envs.arguments.kinds import is_whole
 from quad_envs.arguments.names import shown
 from quad_envs.tasks import Task, TeamTask
 
@@ -67,12 +68,13 @@ def make_plan(request: TrainingRequest) -> Plan:
         MissingPackageError: If what the algorithm needs is not installed.
         CheckpointError: If there is no checkpoint where it is to begin.
     """
-    env_id, algorithm, seed = request.env_id, request.algorithm, request.seed
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < _SEEDS:
+    env_id, algorithm = request.env_id, request.algorithm
+    if not is_whole(request.seed) or not 0 <= request.seed < _SEEDS:
         raise ValueError(
-            f"seed of a training must be a whole number, 0 to {_SEEDS - 1}, got {shown(seed)}; later ones "
-            "are held out for evaluation"
+            f"seed of a training must be a whole number, 0 to {_SEEDS - 1}, got {shown(request.seed)}; later "
+            "ones are held out for evaluation"
         )
+    seed = int(request.seed)
     kwargs = dict(request.env_kwargs or {})
     task_options = training_options(env_id, kwargs)
     mission = task_options.task.mission

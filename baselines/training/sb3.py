@@ -38,6 +38,7 @@ from .vec_env import TaskOptions, TrainingVecEnv
 
 F = TypeVar("F", bound=TrainingVecEnv)
 _PROBES = 500_000_009  # from the seed of training to that of the flights which measure violations
+_QUIET = 0.1  # factor on the weights of SAC's noise, at the start
 _NEVER = 2**31  # updates between logs of stable-baselines3; runs keep their own
 
 
@@ -242,11 +243,16 @@ def make_sac(env: VecEnv, options: SacOptions, seed: int, spent: Callable[[], fl
         policy_kwargs={
             "net_arch": list(options.net_arch),
             "activation_fn": Tanh,
+            "n_critics": options.n_critics,
             "optimizer_kwargs": {"fused": True},
         },
         seed=seed,
         device="cpu",
     )
+    noise: torch.nn.Linear = model.actor.log_std  # type: ignore[assignment]  # Stable-Baselines3 says Parameter
+    with torch.no_grad():  # it hardly depends on what is seen, and does not tip the vehicle over
+        noise.weight.mul_(_QUIET)
+        noise.bias.fill_(options.log_std_init)
     model.set_logger(Logger(None, []))
     return model
 

@@ -97,6 +97,8 @@ class TuningRequest:
             raise ValueError(f"seconds of a tuning must be a number > 0, got {shown(self.seconds)}")
         if self.episodes is not None:
             require_whole("episodes of a tuning", self.episodes, 1)
+            object.__setattr__(self, "episodes", int(self.episodes))  # of numpy it is nothing for JSON
+        object.__setattr__(self, "seed", int(self.seed))
 
     @property
     def folder(self) -> Path:
@@ -191,8 +193,8 @@ def _require_a_generation(request: TuningRequest, candidates: int) -> None:
     least, asked = FLIGHTS * candidates, request.episodes
     if asked is not None and asked < least:
         raise ValueError(
-            f"a tuning of {asked} episode{'s' * (asked != 1)} cannot compare anything: one generation of "
-            f"{candidates} candidates flies {least}; give --episodes {least} or more, or "
+            f"a tuning of {asked} episode{'' if asked == 1 else 's'} cannot compare anything: one "
+            f"generation of {candidates} candidates flies {least}; give --episodes {least} or more, or "
             "tune fewer options (--tuned)"
         )
 
