@@ -158,13 +158,13 @@ class SacOptions:
     n_envs: int = 16  # flights at once
     train_freq: int = 1  # steps of each flight between updates
     gradient_steps: int = 4  # of an update
-    batch_size: int = 256  # samples of a gradient step
+    batch_size: int = 128  # samples of a gradient step
     buffer_size: int = 500_000  # steps in the replay buffer, of all flights
     learning_starts: int = 2_000  # steps of random actions before, of all flights
     learning_rate: float = 2e-3  # of Adam, at the beginning
     final_rate: float = 0.1  # share of the learning rate at the end of the budget
     gamma: float = 0.95  # discount per step
-    tau: float = 0.1  # by which the target critics follow in a gradient step
+    tau: float = 0.2  # by which the target critics follow in a gradient step
     ent_coef: float | str = 0.005  # weight of the entropy; "auto_0.01" learns it, from 0.01
     n_critics: int = 1  # of which the least counts
     log_std_init: float = -1.0  # log of an action's standard deviation at the start
