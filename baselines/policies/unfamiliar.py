@@ -12,11 +12,8 @@ from .registry import behind_filter, is_trained
 from .trained import checkpoint_folder
 from .tuned import names_tuned
 
-_UNFORESEEN = (
-    "disturbance",
-    "sensor_noise",
-    "randomize",
-)  # options of environments that a filter does not know
+# Options of environments that a filter does not know.
+_UNFORESEEN = ("disturbance", "sensor_noise", "randomize")
 _MOST = 32  # characters of a value
 
 

@@ -193,8 +193,8 @@ def _require_a_generation(request: TuningRequest, candidates: int) -> None:
     least, asked = FLIGHTS * candidates, request.episodes
     if asked is not None and asked < least:
         raise ValueError(
-            f"a tuning of {asked} episode{'' if asked == 1 else 's'} cannot compare anything: one "
-            f"generation of {candidates} candidates flies {least}; give --episodes {least} or more, or "
+            f"a tuning of {asked} episode{'s' * (asked != 1)} cannot compare anything: one generation of "
+            f"{candidates} candidates flies {least}; give --episodes {least} or more, or "
             "tune fewer options (--tuned)"
         )
 

@@ -13,8 +13,13 @@ from ...compilation.decorators import kernel
 FLOAT32 = np.dtype(np.float32)  # of actions and observations; numpy takes longer to read `np.float32`
 
 
-def real_numbers(given: Any, what: str) -> NDArray[np.float32]:
+def real_numbers(given: Any, what: str, shape: tuple[int, ...] | None = None) -> NDArray[np.float32]:
     """Actions as float32, contiguous; `what` names them and says what they must be.
+
+    Args:
+        given: They, as somebody gave them.
+        what: Of them, for the message.
+        shape: That they should have, for the message too, which is made only where it is said.
 
     Raises:
         ValueError: If they are no real numbers: text, complex, objects, or lists of several lengths.
@@ -22,7 +27,8 @@ def real_numbers(given: Any, what: str) -> NDArray[np.float32]:
     try:
         return np.asarray(given).astype(FLOAT32, "C", "same_kind", copy=False)
     except (TypeError, ValueError):
-        raise ValueError(f"{what}, got {shown(given)}") from None
+        wanted = what if shape is None else f"{what} of shape {shape}"
+        raise ValueError(f"{wanted}, got {shown(given)}") from None
 
 
 @kernel

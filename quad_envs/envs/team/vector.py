@@ -154,7 +154,7 @@ class TeamVectorEnv(gymnasium.vector.VectorEnv[Observations, NDArray[np.float32]
 
     def step(self, actions: NDArray[np.float32]) -> tuple[Observations, Array, Bools, Bools, dict[str, Any]]:
         """Hold the rotor commands of all vehicles over one control period."""
-        actions = real_numbers(actions, f"actions must be numbers of shape {self.action_space.shape}")
+        actions = real_numbers(actions, "actions must be numbers", self.action_space.shape)
         if actions.shape != self.action_space.shape:
             raise ValueError(f"actions must have shape {self.action_space.shape}, got {actions.shape}")
         if not self._generators:

@@ -139,7 +139,7 @@ class TrackingVectorEnv(
 
     def step(self, actions: NDArray[np.float32]) -> _Step:
         """Hold the rotor commands of all flights over one control period."""
-        actions = real_numbers(actions, f"actions must be numbers of shape ({self.num_envs}, 4)")
+        actions = real_numbers(actions, "actions must be numbers", (self.num_envs, 4))
         if actions.shape != (self.num_envs, 4):
             raise ValueError(f"actions must have shape ({self.num_envs}, 4), got {actions.shape}")
         if not self._generators:
