@@ -263,6 +263,7 @@ _NUMBERS: dict[str, Callable[[Row], str]] = {
     "policy": _policy,
     "score": _spread("score"),
     "minus the best MPC": _minus,
+    "minus the frontier": _spread("score_minus_frontier"),
     "quadratic cost": _spread("quadratic_cost"),
     "constraint cost": _plain("constraint_cost", ".3g"),
     "violating": lambda row: percent(_number(row, "violation_share")),

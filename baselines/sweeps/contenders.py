@@ -14,9 +14,10 @@ import numpy as np
 
 from quad_envs.parameters import Array
 
-from ..evaluation.column import COUNTED, LESS, MORE, TEAM, Column
+from ..evaluation.column import COUNTED, LESS, MORE, REPORTED, TEAM, Column
 from ..evaluation.columns import COLUMNS, limits_in, shown
 from ..evaluation.evaluate import Evaluation
+from ..evaluation.frontier import Flights, above_frontier
 from ..evaluation.metrics import summarize, totals, worst_violations
 from ..evaluation.statistics import Comparison, Interval, compare, difference, mean_interval
 from ..evaluation.table import Table, printed_table
@@ -43,8 +44,19 @@ SCORES = {
             printed="P(better)",
             name="improvement",
         ),
+        Column(
+            *(
+                "Δ frontier",
+                "",
+                "score minus the most that the MPC of the frontier has for this quadratic cost",
+            ),
+            marks=MORE | REPORTED,
+            printed="- frontier",
+            name="score_minus_frontier",
+        ),
     )
 }
+_ABOVE = SCORES["score_minus_frontier"]
 TRAININGS = {
     column.name: column
     for column in (
@@ -111,6 +123,10 @@ class Contender(NamedTuple):
     def beside(self, base: Contender) -> Comparison:
         """The scores of this beside those of another in the same environment."""
         return compare([self.values("score")], [base.values("score")])
+
+    def flights(self) -> Flights:
+        """What places it in the plane of score and quadratic cost."""
+        return Flights(self.values("score"), self.values("quadratic_cost"))
 
     def dearer(self, base: Contender) -> Interval | None:
         """By how much quadratic cost it is dearer than another; None where a crash left no number."""
@@ -218,7 +234,7 @@ def contender_rows(
     rows: list[dict[str, Any]] = []
     for table in tables:
         here = _of_table(contenders, table)
-        rivals = _rivals(here, base)
+        rivals, families = _rivals(here, base), _families(here)
         for one in here:
             rival = rivals[one.env, one.condition]
             row = {"table": table, **one.row(), "mpc": one.mpc, "trace": one.trace, "base": rival.name}
@@ -226,6 +242,8 @@ def contender_rows(
             row |= _spread("score", mean_interval(one.values("score")))
             row |= _spread("quadratic_cost", mean_interval(one.values("quadratic_cost")))
             row |= _spread(_COST.name, one.dearer(rival))
+            family = () if one.trace else families.get((one.env, one.condition), ())
+            row |= _spread(_ABOVE.name, above_frontier(one.flights(), family))
             rows.append(row)
         rows += [{"table": table, **row} for row in _over_all(here, rivals, base)]
     return rows
@@ -245,6 +263,15 @@ def _rivals(contenders: Sequence[Contender], base: str) -> dict[tuple[str, str],
     for one in contenders:
         groups.setdefault((one.env, one.condition), []).append(one)
     return {key: find_base(group, base) for key, group in groups.items()}
+
+
+def _families(contenders: Sequence[Contender]) -> dict[tuple[str, str], list[Flights]]:
+    """Points of the frontier of an environment under a condition, where some fly there."""
+    found: dict[tuple[str, str], list[Flights]] = {}
+    for one in contenders:
+        if one.trace:
+            found.setdefault((one.env, one.condition), []).append(one.flights())
+    return found
 
 
 def find_base(group: Sequence[Contender], base: str) -> Contender:
