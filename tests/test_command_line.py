@@ -26,6 +26,7 @@ from baselines.evaluation.columns import COLUMNS
 from baselines.policies.registry import TEAM_POLICIES, TRACKING_POLICIES, policy_comments, policy_options
 from baselines.policies.trained import SHIPPED
 from baselines.policies.tuned import TunedPolicy, write_tuned
+from baselines.sweeps.contenders import CONTENDER_COLUMNS
 from baselines.sweeps.sweep import REPORTED
 from quad_envs import __version__
 from quad_envs.registration import TEAMS, TRACKING
@@ -315,7 +316,8 @@ def test_every_name_of_the_list_can_be_listed(capsys):
 def test_list_says_what_columns_are(capsys):
     assert main(["list", "columns", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
-    assert list(said) == list(COLUMNS) and all(said.values())
+    assert list(said) == [*COLUMNS, *CONTENDER_COLUMNS] and all(said.values())
+    assert "{" not in "".join(said.values()) and "the policy that others" in said["score_minus_base"]
     assert main(["list", "steady_rms", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"steady_rms": said["steady_rms"]}
     assert said["steady_rms"].startswith("m; ")

@@ -217,6 +217,7 @@ def _without_options(name: str, known: list[str]) -> tuple[dict[str, Any], str]:
     from ..evaluation.columns import COLUMNS
     from ..policies.outside import named_in_file
     from ..policies.trained import describe_folder, describe_shipped, shipped_policies
+    from ..sweeps.contenders import CONTENDER_COLUMNS
     from ..sweeps.suite_files import load_suite, suite_names
 
     if name in VEHICLES:
@@ -235,9 +236,12 @@ def _without_options(name: str, known: list[str]) -> tuple[dict[str, Any], str]:
         numbers = {"episodes": suite.episodes, "seed": suite.seed}
         values = {key: value for key, value in titles.items() if value} | numbers
         return values, f"quad-envs benchmark {name} flies this"
-    if name == "columns" or name in COLUMNS:
-        chosen = COLUMNS.values() if name == "columns" else [COLUMNS[name]]
-        about = {column.name: "; ".join(filter(None, (column.unit, *column.notes))) for column in chosen}
+    columns = COLUMNS | CONTENDER_COLUMNS
+    if name == "columns" or name in columns:
+        chosen = columns.values() if name == "columns" else [columns[name]]
+        others = "the policy that others are compared with"
+        said = {one.name: "; ".join(filter(None, (one.unit, *one.notes))) for one in chosen}
+        about = {key: text.format(base=others) for key, text in said.items()}
         return about, "columns of the tables, each with its unit and what it says"
     if os.path.isdir(name):
         said = describe_folder(name)

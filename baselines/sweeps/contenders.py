@@ -14,7 +14,7 @@ import numpy as np
 
 from quad_envs.parameters import Array
 
-from ..evaluation.column import COUNTED, LESS, MORE, REPORTED, TEAM, Column
+from ..evaluation.column import COUNTED, LESS, MORE, TEAM, Column
 from ..evaluation.columns import COLUMNS, limits_in, shown
 from ..evaluation.evaluate import Evaluation
 from ..evaluation.frontier import Flights, above_frontier
@@ -32,6 +32,8 @@ from .units import Unit, training_units
 ALL = "all environments"
 VIOLATING = 0.01  # share of steps up to which the score alone says which MPC is the best
 _COST = COLUMNS["quadratic_cost"].difference()
+_MORE_THAN_IT = "score minus the most that the MPC of the frontier has for this quadratic cost"
+_ABOVE = Column("Δ frontier", "", _MORE_THAN_IT, MORE, "- frontier", "score_minus_frontier")
 # Columns beyond those of summaries: of the score, with intervals, and of training.
 SEEDS = Column("Seeds", "", "of the training or tuning", COUNTED, name="seeds")
 SCORES = {
@@ -44,19 +46,9 @@ SCORES = {
             printed="P(better)",
             name="improvement",
         ),
-        Column(
-            *(
-                "Δ frontier",
-                "",
-                "score minus the most that the MPC of the frontier has for this quadratic cost",
-            ),
-            marks=MORE | REPORTED,
-            printed="- frontier",
-            name="score_minus_frontier",
-        ),
+        _ABOVE,
     )
 }
-_ABOVE = SCORES["score_minus_frontier"]
 TRAININGS = {
     column.name: column
     for column in (
@@ -71,6 +63,12 @@ TRAININGS = {
         Column("Training", "steps", "environment steps of one training", LESS, "train", "training_steps"),
     )
 }
+CONTENDER_COLUMNS = {
+    **SCORES,
+    _COST.name: _COST,
+    SEEDS.name: SEEDS,
+    **TRAININGS,
+}  # only contenders have these
 
 
 class Contender(NamedTuple):
@@ -337,7 +335,11 @@ def contender_tables(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    beside = {"score": tuple(SCORES.values()), "quadratic_cost": (_COST,)}
+    traced = any(math.isfinite(row.get(_ABOVE.name, math.nan)) for row in rows)
+    beside = {
+        "score": [column for column in SCORES.values() if traced or column is not _ABOVE],
+        "quadratic_cost": [_COST],
+    }
     team = any(name in rows[0] for name, column in COLUMNS.items() if column.has(TEAM))
     columns: list[Column] = []
     for column in shown(team, limits_in(rows[0])):
