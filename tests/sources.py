@@ -4,7 +4,9 @@
 of the wheel: what reads their folders, or runs a tool on them, is skipped there.
 """
 
+import importlib.util
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -15,3 +17,12 @@ reads_sources = pytest.mark.skipif(
     not (ROOT / PACKAGES[0]).is_dir(),
     reason="reads the sources of the packages; here they are installed from a wheel",
 )
+
+
+def script(name: str) -> ModuleType:
+    """One of the scripts that write pages, which lie beside them and are in no package."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

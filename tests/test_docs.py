@@ -16,7 +16,7 @@ import types
 from typing import NamedTuple
 
 import pytest
-from sources import ROOT, reads_sources
+from sources import ROOT, reads_sources, script
 
 from baselines.__main__ import main, make_parser
 from baselines.files import write_csv
@@ -270,13 +270,6 @@ def test_the_site_builds_strictly_and_loads_nothing_from_elsewhere(tmp_path):
         loaded += re.findall(r"<link[^>]*rel=[\"']?stylesheet[^>]*href=[\"']?(https?:[^\"'\s>]+)", text)
         assert not loaded, page
         assert 'class="arithmatex"' not in text, f"{page}: an equation was left as TeX"
-
-
-def script(name):
-    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def test_pages_get_every_column_of_the_tables():
