@@ -98,6 +98,22 @@ def test_away_from_there_mpc_leads_by_what_is_said(made, rows, said):
         assert re.search(rf"\b{rows[LEVELLED, env, WEAK, 'dagger, levelled']['crashed']}\b", text), env
 
 
+def test_what_the_corridor_adds_is_told(made, rows, said):
+    text = said("- *In the corridor* it leads")
+    for condition in (GUSTS, "5 % other parameters"):
+        for table in TABLES:
+            difference = less(best(made, rows, table, "Corridor", condition))
+            assert difference[0] > difference[1] and told(*difference) in text, (condition, table)
+    here = [row for key, row in rows.items() if key[:3] == (AS_DERIVED, "Corridor", GUSTS)]
+    for belongs in (made._is_network, made._is_mpc):
+        shares = [100.0 * number(row, "violation_share") for row in here if belongs(row)]
+        assert f"{min(shares):.0f} to {max(shares):.0f} %" in text
+    row = rows[LEVELLED, "Corridor", STILL, "dagger, levelled"]
+    passes = said("- *In still air none passes the best MPC.*")
+    assert -less(row)[0] > less(row)[1] and told(*less(row)) in passes
+    assert f"{100.0 * number(row, 'violation_share'):.1f} %" in passes
+
+
 def test_unseen_references_are_told(made, rows, said):
     text = said("- *On references that training had not*")
     for condition in UNSEEN:
