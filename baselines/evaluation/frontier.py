@@ -1,8 +1,9 @@
 """How far a policy lies above the frontier: the most score that a family of policies has for its cost.
 
-Between two policies of the family lies one more: who draws for each flight which of the two flies has the
-mean of their scores for the mean of their costs. So the frontier is the upper concave hull of the family's
-points, flat beyond the best of them, which needs no more cost, and it does not reach below the cheapest.
+A policy that draws one of two of the family before each flight has the mean of their scores at the mean of
+their costs. So the frontier is the upper concave hull of the family's points, flat beyond the best of them,
+which needs no more cost. It does not reach below the cheapest. Limits are not looked at, and whose flights
+crash, which leaves no cost, makes no point. The corners are chosen by the flights that are compared.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ class Flights(NamedTuple):
         return float(self.scores.mean())
 
     def along(self, slope: float) -> Array:
-        """What is left of each score where each unit of cost brings this much of it."""
+        """Scores minus slope times costs, (training seeds, starts)."""
         return self.scores - slope * self.costs
 
 
 def frontier(family: Sequence[Flights]) -> list[Flights]:
-    """Those of a family between which the frontier runs, the cheapest first; without those that crashed."""
+    """The corners of the frontier of a family, the cheapest first; those that crashed are left out."""
     hull: list[Flights] = []
     for one in sorted(
         (one for one in family if math.isfinite(one.cost)), key=lambda one: (one.cost, -one.score)
@@ -55,33 +56,32 @@ def frontier(family: Sequence[Flights]) -> list[Flights]:
 def above_frontier(ours: Flights, family: Sequence[Flights]) -> Interval | None:
     """The mean score minus that of the frontier at the same mean cost, paired by starts.
 
-    The interval holds what costs vary, too: along the line between the two neighbours every score is taken
-    less the slope times the cost of its flight, which to first order is what the resampled difference does.
+    The interval includes the spread of the costs, to first order: from each score the slope between the two
+    neighbouring corners times the cost of its flight is taken.
 
     Args:
         ours: Of the policy.
-        family: Of the policies that make the frontier, from the same starts.
+        family: Of the policies that make the frontier, of one seed each, from the same starts.
 
     Returns:
         None where a crash left no cost, there is no family, or the policy is cheaper than all of it.
+
+    Raises:
+        ValueError: If the starts do not match.
     """
+    if len({one.scores.shape[1] for one in (ours, *family)}) > 1:
+        raise ValueError("above_frontier needs flights of all from the same starts")
     hull, cost = frontier(family), ours.cost
-    if not hull or not cost >= hull[0].cost:
+    if not hull or not cost >= hull[0].cost:  # nor where it is nan
         return None
     for low, high in pairwise(hull):
         if cost < high.cost:
             slope, share = _slope(low, high), (cost - low.cost) / (high.cost - low.cost)
-            mixed = (1.0 - share) * _one(low.along(slope)) + share * _one(high.along(slope))
+            mixed = (1.0 - share) * low.along(slope) + share * high.along(slope)
             return difference([ours.along(slope)], [mixed])
-    return difference([ours.scores], [_one(hull[-1].scores)])
+    return difference([ours.scores], [hull[-1].scores])
 
 
 def _slope(low: Flights, high: Flights) -> float:
     """Score for cost between two."""
     return (high.score - low.score) / (high.cost - low.cost)
-
-
-def _one(values: Array) -> Array:
-    """The mean over training seeds, (1, starts)."""
-    mean: Array = values.mean(axis=0, keepdims=True)
-    return mean

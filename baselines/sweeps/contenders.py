@@ -32,7 +32,7 @@ from .units import Unit, training_units
 ALL = "all environments"
 VIOLATING = 0.01  # share of steps up to which the score alone says which MPC is the best
 _COST = COLUMNS["quadratic_cost"].difference()
-_MORE_THAN_IT = "score minus the most that the MPC of the frontier has for this quadratic cost"
+_MORE_THAN_IT = "score minus the most that the MPC of the frontier has at this quadratic cost"
 _ABOVE = Column("Δ frontier", "", _MORE_THAN_IT, MORE, "- frontier", "score_minus_frontier")
 # Columns beyond those of summaries: of the score, with intervals, and of training.
 SEEDS = Column("Seeds", "", "of the training or tuning", COUNTED, name="seeds")
