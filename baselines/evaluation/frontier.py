@@ -41,10 +41,9 @@ class Flights(NamedTuple):
 
 def frontier(family: Sequence[Flights]) -> list[Flights]:
     """The corners of the frontier of a family, the cheapest first; those that crashed are left out."""
+    known = [one for one in family if math.isfinite(one.cost)]
     hull: list[Flights] = []
-    for one in sorted(
-        (one for one in family if math.isfinite(one.cost)), key=lambda one: (one.cost, -one.score)
-    ):
+    for one in sorted(known, key=lambda one: (one.cost, -one.score)):
         if hull and one.score <= hull[-1].score:
             continue
         while len(hull) > 1 and _slope(hull[-2], one) >= _slope(hull[-2], hull[-1]):

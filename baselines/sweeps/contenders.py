@@ -32,8 +32,8 @@ from .units import Unit, training_units
 ALL = "all environments"
 VIOLATING = 0.01  # share of steps up to which the score alone says which MPC is the best
 _COST = COLUMNS["quadratic_cost"].difference()
-_MORE_THAN_IT = "score minus the most that the MPC of the frontier has at this quadratic cost"
-_ABOVE = Column("Δ frontier", "", _MORE_THAN_IT, MORE, "- frontier", "score_minus_frontier")
+_ABOUT = "score minus the most that the MPC of the frontier has at this quadratic cost"
+_ABOVE = Column("Δ frontier", "", _ABOUT, MORE, "- frontier", "score_minus_frontier")
 # Columns beyond those of summaries: of the score, with intervals, and of training.
 SEEDS = Column("Seeds", "", "of the training or tuning", COUNTED, name="seeds")
 SCORES = {
@@ -63,12 +63,8 @@ TRAININGS = {
         Column("Training", "steps", "environment steps of one training", LESS, "train", "training_steps"),
     )
 }
-CONTENDER_COLUMNS = {
-    **SCORES,
-    _COST.name: _COST,
-    SEEDS.name: SEEDS,
-    **TRAININGS,
-}  # only contenders have these
+# All that only contenders have.
+CONTENDER_COLUMNS = SCORES | {column.name: column for column in (_COST, SEEDS)} | TRAININGS
 
 
 class Contender(NamedTuple):
@@ -240,7 +236,7 @@ def contender_rows(
             row |= _spread("score", mean_interval(one.values("score")))
             row |= _spread("quadratic_cost", mean_interval(one.values("quadratic_cost")))
             row |= _spread(_COST.name, one.dearer(rival))
-            family = () if one.trace else families.get((one.env, one.condition), ())
+            family = [] if one.trace else families[one.env, one.condition]
             row |= _spread(_ABOVE.name, above_frontier(one.flights(), family))
             rows.append(row)
         rows += [{"table": table, **row} for row in _over_all(here, rivals, base)]
@@ -257,19 +253,21 @@ def _of_table(contenders: Sequence[Contender], table: str) -> list[Contender]:
 
 def _rivals(contenders: Sequence[Contender], base: str) -> dict[tuple[str, str], Contender]:
     """With whom those of an environment and a condition are compared."""
-    groups: dict[tuple[str, str], list[Contender]] = {}
-    for one in contenders:
-        groups.setdefault((one.env, one.condition), []).append(one)
-    return {key: find_base(group, base) for key, group in groups.items()}
+    return {key: find_base(group, base) for key, group in _together(contenders).items()}
 
 
 def _families(contenders: Sequence[Contender]) -> dict[tuple[str, str], list[Flights]]:
-    """Points of the frontier of an environment under a condition, where some fly there."""
-    found: dict[tuple[str, str], list[Flights]] = {}
+    """The points of the frontier of each environment and condition."""
+    groups = _together(contenders).items()
+    return {key: [one.flights() for one in group if one.trace] for key, group in groups}
+
+
+def _together(contenders: Sequence[Contender]) -> dict[tuple[str, str], list[Contender]]:
+    """Those of each environment and condition."""
+    groups: dict[tuple[str, str], list[Contender]] = {}
     for one in contenders:
-        if one.trace:
-            found.setdefault((one.env, one.condition), []).append(one.flights())
-    return found
+        groups.setdefault((one.env, one.condition), []).append(one)
+    return groups
 
 
 def find_base(group: Sequence[Contender], base: str) -> Contender:
